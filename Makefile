@@ -1,0 +1,93 @@
+# Everything a developer runs. Needs make and Python 3.11 or newer, nothing else.
+
+VENV := .venv
+# Deferred: Python is looked for only where it is used.
+PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
+RUN := $(VENV)/bin/python
+STAMP := $(VENV)/.installed
+
+comma := ,
+# $(call option,NAME,VALUE): `--NAME VALUE` where VALUE is set, else nothing.
+option = $(if $(strip $(2)),--$(1) $(2))
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup lock lint format test test-slow bench-brax bench-speed readme clean
+
+help: ## Say what there is
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
+	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED BACKEND OUT where set.'
+
+setup: $(STAMP) ## Make .venv with the pinned versions (does nothing when up to date)
+
+# An environment that can run pip is kept, anything else is made anew.
+define make_venv
+@$(RUN) -m pip --version >/dev/null 2>&1 || { \
+	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+		echo 'error: "$(PYTHON)" is not Python 3.11 or newer;' \
+			'name one: make setup PYTHON=/path/to/python3.11' >&2; \
+		exit 1; }; \
+	echo 'Making $(VENV)'; \
+	"$(PYTHON)" -m venv --clear $(VENV); }
+endef
+
+$(STAMP): pyproject.toml constraints.txt
+	$(make_venv)
+	$(RUN) -m pip install --quiet --disable-pip-version-check \
+		-c constraints.txt -e '.[dev]'
+	@touch $@
+
+# Pins in constraints.txt stay; `make lock UPGRADE=1` looks for newer versions.
+lock: ## Resolve the dependencies anew into constraints.txt (UPGRADE=1: newest)
+	$(make_venv)
+	$(RUN) -m pip install --quiet --disable-pip-version-check \
+		--dry-run --ignore-installed --report $(VENV)/lock.json \
+		$(if $(UPGRADE),,-c constraints.txt) -e '.[dev]'
+	$(RUN) -c "$$LOCK" <$(VENV)/lock.json >$(VENV)/constraints.txt
+	mv $(VENV)/constraints.txt constraints.txt
+
+define LOCK
+import json, sys
+
+print("# The versions that are tested together. Made by `make lock`: do not edit.")
+packages = [item["metadata"] for item in json.load(sys.stdin)["install"]]
+for package in sorted(packages, key=lambda package: package["name"].lower()):
+    if package["name"] != "rewire_jax":
+        print(package["name"] + "==" + package["version"])
+endef
+export LOCK
+
+lint: setup ## Check style, format and types
+	$(RUN) -m ruff check
+	$(RUN) -m ruff format --check
+	$(RUN) -m mypy rewire_jax experiments
+
+format: setup ## Mend what ruff can mend
+	$(RUN) -m ruff check --fix
+	$(RUN) -m ruff format
+
+test: lint ## Set up, lint, run all tests but the slow ones
+	$(RUN) -m pytest -m 'not slow'
+
+test-slow: setup ## Run the slow tests
+	$(RUN) -m pytest -m slow
+
+bench-brax: setup ## Run the methods on a Brax scenario, make its table and figures
+	$(RUN) -m experiments.bench_brax $(strip \
+		$(call option,scenario,$(SCENARIO)) \
+		$(call option,methods,$(subst $(comma), ,$(METHODS))) \
+		$(call option,profile,$(PROFILE)) \
+		$(call option,seeds,$(SEEDS)) \
+		$(call option,seed,$(SEED)) \
+		$(call option,backend,$(BACKEND)) \
+		$(call option,out,$(OUT)))
+
+bench-speed: setup ## Measure interactions and updates a second
+	$(RUN) -m experiments.bench_speed
+
+readme: setup ## Make the tables of README.md anew from experiments/results
+	$(RUN) -m experiments.readme
+
+clean: ## Remove caches and build outputs; .venv and runs/ stay
+	rm -rf .jax_cache .mypy_cache .pytest_cache .ruff_cache build dist *.egg-info
+	find rewire_jax experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Continual reinforcement learning by rewiring neurons, in JAX."""

@@ -1,0 +1,264 @@
+"""Checkpoints: folders of arrays that are complete or not there.
+
+A checkpoint holds named items, each a pytree of arrays in an Orbax folder of its
+own, so that a policy is read without the replay buffer beside it. `manifest.json`
+lists the leaves of each item and the size and SHA-256 of each file. All is written
+under a temporary name and renamed when it is on disk. A folder of checkpoints has
+one writer at a time.
+"""
+
+import ctypes
+import hashlib
+import itertools
+import json
+import logging
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from rewire_jax.errors import UserError
+
+_FORMAT = 1
+_MANIFEST = "manifest.json"
+_TEMPORARY = ".tmp-"
+_KINDS = (np.bool_, np.number, jax.dtypes.prng_key)
+
+
+class CheckpointError(UserError):
+    """A checkpoint that is missing, damaged, or not what the caller expects."""
+
+
+def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
+    """Writes a checkpoint; until it is done, `path` stays what it was.
+
+    Args:
+      path: the folder to make, or to replace.
+      items: pytrees of arrays, by the name under which `load` finds them.
+      metadata: what JSON can hold; its int `order` ranks it in `available`.
+
+    Raises:
+      UserError: the disk is full or the folder cannot be written.
+      TypeError: a leaf is not an array of numbers.
+    """
+    path = Path(path).absolute()  # Orbax refuses relative paths.
+    content: dict[str, Any] = {
+        "metadata": {**metadata, "order": int(metadata["order"])},
+        "items": {name: [*_describe(name, tree)] for name, tree in items.items()},
+    }
+    temporary = path.parent / f"{_TEMPORARY}{path.name}"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for left_over in path.parent.glob(f"{_TEMPORARY}*"):
+            shutil.rmtree(left_over)
+        temporary.mkdir()
+        for name, tree in items.items():
+            _write_item(temporary / name, tree)
+        files = sorted(file for file in temporary.rglob("*") if file.is_file())
+        content["files"] = {
+            file.relative_to(temporary).as_posix(): _fingerprint(file) for file in files
+        }
+        manifest = {"format": _FORMAT, "sha256": _digest(content), "content": content}
+        (temporary / _MANIFEST).write_text(json.dumps(manifest, indent=1))
+        for entry in [*temporary.rglob("*"), temporary]:
+            _sync(entry)
+        _replace(temporary, path)
+        _sync(path.parent)
+    except (OSError, ValueError) as error:  # TensorStore's are ValueErrors.
+        raise UserError(
+            f"cannot write checkpoint {path}: {_reason(error)}; free space or make the "
+            "folder writable, then run again (earlier checkpoints are untouched)"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def load(
+    path: Path, items_like: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Verifies and reads the named items; files of other items are not touched.
+
+    Args:
+      path: the checkpoint.
+      items_like: for each item wanted, a pytree of arrays or
+        `jax.ShapeDtypeStruct` with its structure, shapes and dtypes.
+
+    Returns:
+      The items with numpy arrays, wherever the saved ones lived, and the metadata.
+
+    Raises:
+      CheckpointError: it is missing or damaged, or differs from `items_like`.
+    """
+    path = Path(path).absolute()
+    content = _read_manifest(path)
+    for name, like in items_like.items():
+        stored = content["items"].get(name, ())
+        for have, want in itertools.zip_longest(stored, _describe(name, like)):
+            if have != want:
+                raise CheckpointError(
+                    f"checkpoint {path} holds {have or 'no leaf'} where "
+                    f"{want or 'no leaf'} is expected"
+                )
+    try:
+        for file, fingerprint in content["files"].items():
+            wanted = file.partition("/")[0] in items_like
+            if wanted and _fingerprint(path / file) != fingerprint:
+                raise ValueError(f"{file} has other bytes than were written")
+        items = {name: _read_item(path / name, x) for name, x in items_like.items()}
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    return items, content["metadata"]
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """Reads the metadata only.
+
+    Raises:
+      CheckpointError: the manifest is missing or damaged.
+    """
+    return _read_manifest(Path(path))["metadata"]
+
+
+def available(folder: Path) -> list[Path]:
+    """Lists the checkpoints in `folder`, the highest `order` first.
+
+    Raises:
+      CheckpointError: a manifest is damaged.
+    """
+    found = (file.parent for file in Path(folder).glob(f"[!.]*/{_MANIFEST}"))
+    return sorted(found, key=lambda path: read_metadata(path)["order"], reverse=True)
+
+
+def _describe(item: str, tree: Any) -> Iterator[str]:
+    """Yields a line for each leaf, such as `policy['w'] float32[3,4]`."""
+    for key_path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        name = item + jax.tree_util.keystr(key_path)
+        dtype = getattr(leaf, "dtype", object)
+        if not any(jnp.issubdtype(dtype, kind) for kind in _KINDS):
+            raise TypeError(f"{name} is not an array of numbers: {leaf!r}")
+        yield f"{name} {dtype}[{','.join(map(str, leaf.shape))}]"
+
+
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _write_item(folder: Path, tree: Any) -> None:
+    leaves = [
+        jax.random.key_data(x) if _is_key(x) else x for x in jax.tree.leaves(tree)
+    ]
+    # Orbax gets numbered host arrays, so that its files hold neither our classes nor
+    # our devices. It stores no empty arrays and no empty trees.
+    arrays = {str(i): np.asarray(x) for i, x in enumerate(leaves) if x.size}
+    if arrays:
+        with _orbax() as orbax:
+            orbax.save(folder, args=ocp.args.PyTreeSave(arrays))
+
+
+def _read_item(folder: Path, like: Any) -> Any:
+    leaves, structure = jax.tree.flatten(like)
+    names = [str(i) for i, x in enumerate(leaves) if 0 not in x.shape]
+    if names:
+        host = ocp.RestoreArgs(restore_type=np.ndarray)
+        args = ocp.args.PyTreeRestore(
+            item=dict.fromkeys(names, 0), restore_args=dict.fromkeys(names, host)
+        )
+        with _orbax() as orbax:
+            arrays = orbax.restore(folder, args=args)
+    for i, leaf in enumerate(leaves):
+        if 0 in leaf.shape:
+            leaves[i] = np.empty(leaf.shape, leaf.dtype)
+        elif _is_key(leaf):
+            impl = jax.random.key_impl(jnp.empty((), leaf.dtype))
+            leaves[i] = jax.random.wrap_key_data(arrays[str(i)], impl=impl)
+        else:
+            leaves[i] = arrays[str(i)]
+    return jax.tree.unflatten(structure, leaves)
+
+
+@contextmanager
+def _orbax() -> Iterator[ocp.Checkpointer]:
+    """A synchronous checkpointer that reports by exceptions alone."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)  # It logs tracebacks when the disk is full.
+    try:
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
+            yield checkpointer
+    finally:
+        logger.setLevel(level)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads((path / _MANIFEST).read_bytes())
+        if manifest["format"] != _FORMAT:
+            other = ValueError(f"format {manifest['format']}, not {_FORMAT}")
+            raise _unreadable(path, other)
+        if manifest["sha256"] != _digest(manifest["content"]):
+            raise ValueError
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    except (ValueError, KeyError, TypeError) as error:
+        damage = ValueError(f"{_MANIFEST} is damaged or foreign")
+        raise _unreadable(path, damage) from error
+    return manifest["content"]
+
+
+def _unreadable(path: Path, error: Exception) -> CheckpointError:
+    return CheckpointError(
+        f"cannot read checkpoint {path}: {_reason(error)}; use an earlier one"
+    )
+
+
+def _reason(error: Exception) -> str:
+    """One line; TensorStore hides the error number in a long text."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror} {error.filename or ''}".strip()
+    code = re.search(r"os_error_code='(\d+)'", str(error))
+    return os.strerror(int(code[1])) if code else str(error).partition("\n")[0]
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+
+def _fingerprint(file: Path) -> list[Any]:
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    return [file.stat().st_size, digest]
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _replace(new: Path, path: Path) -> None:
+    """Moves `new` to `path`; a folder that stood there ends at `new`."""
+    if not path.exists():
+        new.rename(path)
+        return
+    try:  # Linux swaps two folders in one step, for which Python has no name.
+        here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+        failed = ctypes.CDLL(None).renameat2(
+            here, bytes(new), here, bytes(path), exchange
+        )
+    except AttributeError:
+        failed = True
+    if failed:  # Elsewhere (NFS, macOS) there is a moment with neither.
+        aside = path.with_name(f"{_TEMPORARY}old")
+        path.rename(aside)
+        new.rename(path)
+        aside.rename(new)

@@ -1,0 +1,219 @@
+"""Settings of a run: frozen dataclasses whose numbers may be traced."""
+
+import dataclasses
+import typing
+from typing import Any, Literal, TypeVar
+
+import jax
+
+from rewire_jax.errors import UserError
+
+T = TypeVar("T")
+
+TimeLimit = Literal["terminal", "bootstrap"]
+"""What a time limit means to the critic: an end, or a cut to look beyond."""
+
+
+def traced(default: int) -> Any:
+    """An integer setting that, like most floats, may differ between members."""
+    return dataclasses.field(default=default, metadata={"traced": True})
+
+
+def static(default: float) -> Any:
+    """A float setting that shapes the program, and so is the same for all members."""
+    return dataclasses.field(default=default, metadata={"traced": False})
+
+
+@typing.dataclass_transform(frozen_default=True, kw_only_default=True)
+def settings(cls: type[T]) -> type[T]:
+    """A frozen keyword-only dataclass that is also a pytree.
+
+    Floats and `traced` integers are leaves, so that they can be traced and
+    vmapped over; all else shapes the program and is static.
+    """
+    cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    leaves = [f.name for f in fields if f.metadata.get("traced", f.type is float)]
+    jax.tree_util.register_dataclass(
+        cls,
+        data_fields=leaves,
+        meta_fields=[f.name for f in fields if f.name not in leaves],
+    )
+    return cls
+
+
+@settings
+class SacSettings:
+    """Soft Actor-Critic.
+
+    Attributes:
+      lr_policy: Adam's learning rate for the policy.
+      lr_critic: the same for both critics.
+      lr_temperature: the same for the entropy temperature.
+      reward_scale: factor on rewards in the critics' targets.
+      target_multiplier: target entropy is minus this times the action size.
+      initial_temperature: entropy temperature at the start of every task.
+      discount: of future rewards, per step.
+      target_rate: share of the critics that moves into their targets.
+      hidden: neurons in each hidden layer.
+      depth: hidden layers of the policy and of each critic.
+      batch_size: transitions in an update.
+      policy_delay: critic updates for each update of policy and temperature.
+      target_delay: critic updates for each update of the targets.
+      time_limit: what a time limit means to the critics.
+    """
+
+    lr_policy: float = 3e-4
+    lr_critic: float = 3e-4
+    lr_temperature: float = 3e-4
+    reward_scale: float = 1.0
+    target_multiplier: float = 1.0
+    initial_temperature: float = 2.0
+    discount: float = 0.99
+    target_rate: float = 0.005
+    hidden: int = 256
+    depth: int = 3
+    batch_size: int = 256
+    policy_delay: int = 2
+    target_delay: int = 2
+    time_limit: TimeLimit = "terminal"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Everything a run is made of; saved with it.
+
+    Attributes:
+      scenario: name of the task sequence.
+      method: name of the method.
+      profile: whose values the settings started from.
+      backend: physics backend.
+      seed: seed of the first member.
+      seeds: how many members, seeded one after the other.
+      tasks: how many tasks of the sequence are run.
+      interactions: training interactions (environment steps) for each task.
+      paper_interactions: the same in the paper, for comparison in reports.
+      envs: parallel environments of a member.
+      updates: SAC updates after each step of all environments.
+      warmup: interactions of each task before its first update.
+      random_interactions: interactions of each task with uniform actions.
+      buffer: transitions kept at most.
+      eval_episodes: episodes for each task in an evaluation.
+      selection_episodes: episodes of all candidates together when a method
+        chooses among policies by their return; counted as interactions.
+      report_every: interactions between two progress reports.
+      checkpoint_every: interactions between two full checkpoints, 0 for none.
+      sac: Soft Actor-Critic's settings.
+      options: the method's own settings.
+    """
+
+    scenario: str
+    method: str
+    profile: str
+    backend: str
+    seed: int = 0
+    seeds: int = 1
+    tasks: int
+    interactions: int
+    paper_interactions: int
+    envs: int = 128
+    updates: int = 64
+    warmup: int = 12_800
+    random_interactions: int = 0
+    buffer: int = 1_280_000
+    eval_episodes: int = 512
+    selection_episodes: int = 128
+    report_every: int = 20_000
+    checkpoint_every: int = 250_000
+    sac: SacSettings
+    options: Any
+
+
+_AT_LEAST: dict[str, float] = {
+    "seed": 0,
+    "seeds": 1,
+    "tasks": 1,
+    "envs": 1,
+    "updates": 1,
+    "warmup": 0,
+    "random_interactions": 0,
+    "buffer": 1,
+    "eval_episodes": 1,
+    "selection_episodes": 0,
+    "report_every": 1,
+    "checkpoint_every": 0,
+    "reward_scale": 0,
+    "target_multiplier": 0,
+    "hidden": 1,
+    "depth": 1,
+    "batch_size": 1,
+    "policy_delay": 1,
+    "target_delay": 1,
+}
+_POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
+_SHARE = ("discount", "target_rate")
+
+
+def require(condition: bool, message: str) -> None:
+    """Raises `UserError(message)` unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
+def flag(name: str) -> str:
+    """The command-line flag of a setting."""
+    return "--" + name.replace("_", "-")
+
+
+def validate(run: Settings) -> None:
+    """Raises `UserError` if a value of `run` or `run.sac` makes no sense.
+
+    A method's own options are checked by the method.
+    """
+    values = vars(run) | vars(run.sac)
+    for name, value in values.items():
+        if isinstance(value, float):
+            require(value - value == 0, f"{flag(name)} must be finite, not {value}")
+    for name, least in _AT_LEAST.items():
+        require(
+            values[name] >= least,
+            f"{flag(name)} must be at least {least:g}, not {values[name]}",
+        )
+    for name in _POSITIVE:
+        require(values[name] > 0, f"{flag(name)} must be above 0, not {values[name]}")
+    for name in _SHARE:
+        require(
+            0 < values[name] <= 1,
+            f"{flag(name)} must lie in (0, 1], not {values[name]}",
+        )
+    require(
+        run.interactions >= run.warmup + run.envs,
+        f"--interactions {run.interactions} leaves nothing to learn from after "
+        f"--warmup {run.warmup}: raise the one or lower the other",
+    )
+    require(
+        run.buffer >= run.envs,
+        f"--buffer {run.buffer} is below one step of --envs {run.envs}",
+    )
+
+
+def to_json(run: Settings) -> dict[str, Any]:
+    """The settings as a JSON-ready dictionary."""
+    return dataclasses.asdict(run)
+
+
+def from_json(data: dict[str, Any], options: type) -> Settings:
+    """The settings that `to_json` wrote; `options` is the method's settings class.
+
+    Raises:
+      UserError: if a field is missing or unknown.
+    """
+    try:
+        return Settings(
+            **data
+            | {"sac": SacSettings(**data["sac"]), "options": options(**data["options"])}
+        )
+    except (TypeError, KeyError) as error:
+        raise UserError(
+            f"the saved settings do not fit this version of rewire_jax: {error}"
+        ) from error

@@ -1,0 +1,93 @@
+"""What every environment of this project looks like: pure functions over pytrees."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+
+
+class Task(NamedTuple):
+    """What turns a domain into one task, as data, so that no task compiles anew.
+
+    Attributes:
+      physics: pytree that the environment's functions take (brax: its `System`).
+      action_scale: `[actions]`, multiplies every action before it acts and is
+        charged for: 0 masks it, -1 inverts it.
+      observation_mask: `[observations]`, multiplies every observation: 0 hides it.
+    """
+
+    physics: Any
+    action_scale: jax.Array
+    observation_mask: jax.Array
+
+
+class State(NamedTuple):
+    """One environment between two steps.
+
+    Attributes:
+      inner: pytree of the simulator's own state.
+      observation: `[observations]`, masked.
+      reward: `[]`, of the step that led here, 0 after a reset.
+      terminal: `[]` bool, the task itself ended here (never a time limit).
+    """
+
+    inner: Any
+    observation: jax.Array
+    reward: jax.Array
+    terminal: jax.Array
+
+
+class Environment(NamedTuple):
+    """One unbatched environment; callers vmap over keys, states and tasks.
+
+    Attributes:
+      reset: `(task, key) -> State`.
+      step: `(task, state, action) -> State`; action `[actions]` in [-1, 1].
+      observation_size: length of an observation.
+      action_size: length of an action.
+      episode_length: steps after which an episode is cut off.
+    """
+
+    reset: Callable[[Task, jax.Array], State]
+    step: Callable[[Task, State, jax.Array], State]
+    observation_size: int
+    action_size: int
+    episode_length: int
+
+
+@dataclass(frozen=True)
+class TaskChange:
+    """How a task differs from its unchanged domain, in names rather than indices.
+
+    Attributes:
+      name: the task's name.
+      gravity: factor on gravity.
+      friction: factor on the friction of every geometry.
+      bodies: body name -> factor on its mass and collision radius.
+      actions: joint name -> factor on its action (0 masks, -1 inverts);
+        the name `"*"` stands for all joints.
+      hidden: share of the observation entries that is masked to 0, a fixed
+        random choice.
+      extra: values that only the domain itself understands.
+    """
+
+    name: str
+    gravity: float = 1.0
+    friction: float = 1.0
+    bodies: Mapping[str, float] = field(default_factory=dict)
+    actions: Mapping[str, float] = field(default_factory=dict)
+    hidden: float = 0.0
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Domain(NamedTuple):
+    """An environment and the way to make its tasks.
+
+    Attributes:
+      environment: shared by all tasks of the domain.
+      make_task: `TaskChange -> Task`; raises `UserError` on unknown names.
+    """
+
+    environment: Environment
+    make_task: Callable[[TaskChange], Task]

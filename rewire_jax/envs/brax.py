@@ -1,0 +1,210 @@
+"""Brax's HalfCheetah, Ant and Humanoid as domains whose tasks are data.
+
+A task's physics is a whole brax `System`. All of one domain's systems share
+their structure and static fields, so one trace serves them all, and they can be
+stacked and vmapped.
+"""
+
+import copy
+import functools
+import warnings
+from typing import Any
+
+import brax.envs
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.base import System
+from brax.envs.base import PipelineEnv
+from brax.envs.base import State as BraxState
+
+from rewire_jax.envs import changes
+from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
+from rewire_jax.errors import UserError
+
+NAMES = ("halfcheetah", "ant", "humanoid")
+BACKENDS = ("positional", "spring", "generalized", "mjx")
+EPISODE_LENGTH = 1000
+
+# Which geoms of a body its factor resizes. Brax v1 resized a body's first
+# collider on HalfCheetah and its last on Humanoid (a shin's last is the foot).
+# An Ant leg had one collider in v1; here it is a capsule with a foot, and only
+# the foot touches the ground.
+_RESIZED = {
+    "halfcheetah": slice(0, 1),
+    "ant": slice(None),
+    "humanoid": slice(-1, None),
+}
+
+
+def make_domain(name: str, backend: str = "positional") -> Domain:
+    """Makes a domain; the same arguments give the identical object.
+
+    Args:
+      name: `"halfcheetah"`, `"ant"` or `"humanoid"`.
+      backend: `"positional"`, `"spring"`, `"generalized"` or `"mjx"`.
+
+    Returns:
+      The domain. Body names are MuJoCo's; Ant's unnamed lower legs are called
+      `lower_leg_1` to `lower_leg_4` after the ankle they hang on. Bodies
+      without a joint are part of their parent (Humanoid's feet: the shins).
+
+    Raises:
+      UserError: no such name or backend.
+    """
+    changes.check_names("Brax domain", [name], NAMES)
+    changes.check_names("Brax backend", [backend], BACKENDS)
+    return _make_domain(name, backend)
+
+
+@functools.cache
+def _make_domain(name: str, backend: str) -> Domain:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Brax System", UserWarning)
+        env = brax.envs.get_environment(name, backend=backend)
+    env.sys = system = _normalize(env.sys, backend)
+    environment = _make_environment(env)
+    bodies = _body_ids(system.mj_model)
+    joints = [
+        system.mj_model.joint(joint).name
+        for joint in system.mj_model.actuator_trnid[:, 0]
+    ]
+
+    def make_task(change: TaskChange) -> Task:
+        if change.extra:
+            raise UserError(f"Brax tasks take no extra values: {dict(change.extra)}.")
+        _check_factors(change, list(bodies))
+        return Task(
+            physics=_change_system(system, change, bodies, _RESIZED[name]),
+            action_scale=changes.action_scale(joints, change.actions),
+            observation_mask=changes.observation_mask(
+                environment.observation_size, change.hidden
+            ),
+        )
+
+    return Domain(environment, make_task)
+
+
+def _make_environment(env: PipelineEnv) -> Environment:
+    def with_physics(task: Task) -> PipelineEnv:
+        changed = copy.copy(env)
+        changed.sys = task.physics
+        return changed
+
+    def reset(task: Task, key: jax.Array) -> State:
+        state = with_physics(task).reset(key)
+        return State(
+            inner=state.pipeline_state,
+            observation=state.obs * task.observation_mask,
+            reward=jnp.zeros_like(state.reward),
+            terminal=jnp.zeros((), bool),
+        )
+
+    def step(task: Task, state: State, action: jax.Array) -> State:
+        # Of its own state, brax's step reads the pipeline state alone.
+        before = BraxState(
+            pipeline_state=state.inner,
+            obs=state.observation,
+            reward=state.reward,
+            done=jnp.zeros_like(state.reward),
+        )
+        # Scaled first, so that the control cost is charged on what acts.
+        after = with_physics(task).step(before, action * task.action_scale)
+        return State(
+            inner=after.pipeline_state,
+            observation=after.obs * task.observation_mask,
+            reward=after.reward,
+            terminal=after.done.astype(bool),
+        )
+
+    observation = jax.eval_shape(lambda key: env.reset(key).obs, jax.random.key(0))
+    return Environment(
+        reset=reset,
+        step=step,
+        observation_size=observation.shape[0],
+        action_size=env.action_size,
+        episode_length=EPISODE_LENGTH,
+    )
+
+
+def _normalize(system: System, backend: str) -> System:
+    """Makes every leaf an array and the masses those that act."""
+    changed: dict[str, Any] = {"tex_data": jnp.zeros(0, jnp.uint8)}  # half a megabyte
+    if backend in ("positional", "spring"):
+        # These two raise each mass to 1 - spring_mass_scale (Ant: to 0) before
+        # they use it, which would shrink a body factor or undo it.
+        mass = system.link.inertia.mass ** (1 - system.spring_mass_scale)
+        changed |= {"link.inertia.mass": mass, "spring_mass_scale": 0.0}
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)),
+        system.tree_replace(changed),
+    )
+
+
+def _body_ids(model: mujoco.MjModel) -> dict[str, int]:
+    """Every moving body's MuJoCo index by its name."""
+    ids = {}
+    for body in range(1, model.nbody):
+        joint = model.joint(model.body_jntadr[body]).name
+        name = model.body(body).name or joint.replace("ankle", "lower_leg")
+        ids[name] = body
+    return ids
+
+
+def _check_factors(change: TaskChange, bodies: list[str]) -> None:
+    changes.check_names("body", change.bodies, bodies)
+    for body, factor in change.bodies.items():
+        if not factor > 0:
+            raise UserError(f"The factor of body {body!r} must be > 0, not {factor}.")
+    if not change.friction >= 0:
+        raise UserError(f"friction must be >= 0, not {change.friction}.")
+
+
+def _change_system(
+    system: System, change: TaskChange, bodies: dict[str, int], resized: slice
+) -> System:
+    """The system with its gravity, friction, masses and radii changed.
+
+    Args:
+      system: the unchanged domain's.
+      change: valid for this domain.
+      bodies: body name -> MuJoCo index.
+      resized: which of a changed body's geoms get another radius.
+
+    Returns:
+      A system of the same structure, shapes and dtypes. Inertias stay.
+    """
+    model = copy.copy(system.mj_model)
+    mass = np.ones(model.nbody)
+    radius = np.ones(model.ngeom)
+    for name, factor in change.bodies.items():
+        mass[bodies[name]] = factor
+        radius[np.flatnonzero(model.geom_bodyid == bodies[name])[resized]] = factor
+    # MuJoCo derives the softness of contacts and limits from the masses; let it.
+    model.body_mass[:] *= mass
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+    size = system.geom_size
+    new = {
+        "gravity": system.gravity * change.gravity,
+        "opt.gravity": system.opt.gravity * change.gravity,
+        # All three columns, as v1 had one number. Of two geoms that touch the
+        # rougher one counts, so all of them change, the floor too.
+        "geom_friction": system.geom_friction * change.friction,
+        # The radius only: a capsule keeps the distance between its ends. The
+        # bound of a capsule or a sphere grows as its radius does.
+        "geom_size": size.at[:, 0].multiply(radius),
+        "geom_rbound": system.geom_rbound + size[:, 0] * (radius - 1),
+        "link.inertia.mass": system.link.inertia.mass * mass[1:],
+        "body_mass": model.body_mass,
+        "body_subtreemass": model.body_subtreemass,
+        "body_invweight0": model.body_invweight0,
+        "dof_invweight0": model.dof_invweight0,
+        "link.invweight": model.body_invweight0[1:, 0],
+        "dof.invweight": model.dof_invweight0,
+        "stat.meaninertia": model.stat.meaninertia,
+    }
+    # A new array for each: MuJoCo's are views of a model that dies here.
+    changed = system.tree_replace({k: jnp.array(v) for k, v in new.items()})
+    return jax.tree.map(lambda x, old: x.astype(old.dtype), changed, system)

@@ -1,0 +1,251 @@
+"""Pictures of runs: learning curves over the sequence, and task × stage maps."""
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import EngFormatter, StrMethodFormatter
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's palette, told apart with any colour vision; yellow is left out as too
+# pale for a line on white. Beyond its length the line style changes too.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
+_STYLES = ("-", "--", ":")
+
+
+class Line(NamedTuple):
+    """One method's picture data; seeds without a valid result are left out before.
+
+    Attributes:
+        label: the method.
+        curve: per stage, interactions within the task `[points]` and training returns
+            `[seeds, points]`, NaN where there is none.
+        scores: evaluation returns `[seeds, 1 + stages, tasks]`, the first row before
+            any training, NaN where there is none.
+    """
+
+    label: str
+    curve: Sequence[tuple[Array, Array]]
+    scores: Array
+
+
+def number(value: float | None, scale: float | None = None) -> str:
+    """A value as tables and cells show it; more decimals where `scale` is small.
+
+    Args:
+        value: None and NaN are shown as a dash.
+        scale: the magnitude that decides the decimals, by default the value's own.
+    """
+    if value is None or np.isnan(value):
+        return "–"
+    size = abs(value) if scale is None else scale
+    text = f"{value:,.{0 if size >= 100 else 1 if size >= 10 else 2}f}"
+    return text.removeprefix("-") if not text.strip("-0.") else text
+
+
+def mean(values: Array) -> Array:
+    """Mean over the first axis without NaN; NaN, and no warning, where all are."""
+    count = np.sum(~np.isnan(values), axis=0)
+    total = np.nansum(values, axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def curves(
+    lines: Sequence[Line], tasks: Sequence[str], budget: int, title: str, path: Path
+) -> None:
+    """Writes the training returns over the whole sequence, tasks side by side.
+
+    Args:
+        lines: one for each method.
+        tasks: names of the sequence.
+        budget: interactions a task.
+        title: above the picture.
+        path: the PNG file to write.
+    """
+    figure, (axes,) = _figure((max(8.0, 1.5 * len(tasks)), 5.2), 1, 1)
+    for i, line in enumerate(lines):
+        _draw_curve(axes, i, line, budget, alpha=0.36 / max(2, len(lines)))
+    for k, name in enumerate(tasks):
+        axes.axvline(k * budget, color="0.6", linewidth=0.8, zorder=0)
+        # One word a line: eight long names fit side by side.
+        label = name.replace("_", "\n")
+        axes.annotate(
+            label,
+            xy=((k + 0.5) * budget, 1.0),
+            xytext=(0, 5),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=9,
+            linespacing=1.05,
+        )
+    axes.set_xlim(0, len(tasks) * budget)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
+    axes.set_xlabel("training interactions, each seed")
+    axes.set_ylabel("return")
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    shared: dict[str, Any] = {"color": "0.3", "linestyle": "none", "markersize": 7}
+    key = [
+        Line2D([], [], **_look(i), label=line.label) for i, line in enumerate(lines)
+    ] + [
+        Line2D(
+            [], [], marker="o", fillstyle="none", label="evaluated before", **shared
+        ),
+        Line2D([], [], marker="o", label="evaluated right after", **shared),
+    ]
+    figure.legend(
+        handles=key, loc="outside lower center", ncols=min(len(key), 6), frameon=False
+    )
+    _entitle(
+        figure,
+        title,
+        "lines: training episodes, mean over seeds, band from lowest to highest",
+    )
+    figure.savefig(path)
+
+
+def matrices(
+    lines: Sequence[Line], tasks: Sequence[str], title: str, path: Path
+) -> None:
+    """Writes a heat map of task × stage for each method, means in the cells.
+
+    A frame marks where a task had just been trained. All maps share one colour scale.
+
+    Args:
+        lines: one for each method.
+        tasks: names of the sequence.
+        title: above the picture.
+        path: the PNG file to write.
+    """
+    maps = [mean(line.scores).T for line in lines]
+    values = np.concatenate([m[~np.isnan(m)] for m in maps])
+    low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+    # Equal ends would give a scale without extent.
+    scale = Normalize(low, high if high > low else low + 1)
+    columns = min(2, len(lines))
+    rows = -(-len(lines) // columns)
+    count = len(tasks)
+    width = max(7.0, columns * (2.0 + 0.62 * (count + 1)) + 1)
+    height = rows * (1.2 + 0.42 * count) + 1
+    figure, panels = _figure((width, height), rows, columns)
+    # All cells of a picture have as many decimals as the largest needs.
+    size = max(abs(low), abs(high))
+    names = [f"{k + 1} {name}" for k, name in enumerate(tasks)]
+    image = None
+    for axes, line, cells in zip(panels, lines, maps, strict=False):
+        image = axes.imshow(cells, cmap="cividis", norm=scale, aspect="auto")
+        axes.set_title(line.label, fontsize=12)
+        axes.set_yticks(range(count), names)
+        axes.set_xticks(range(count + 1), ["before", *map(str, range(1, count + 1))])
+        axes.set_ylabel("evaluated on")
+        axes.set_xlabel("after training on task")
+        axes.tick_params(length=0, labelsize=9)
+        for (task, stage), value in np.ndenumerate(cells):
+            red, green, blue, _ = colormaps["cividis"](scale(value))
+            dark = 0.299 * red + 0.587 * green + 0.114 * blue < 0.5
+            colour = "white" if dark and not np.isnan(value) else "black"
+            axes.text(
+                stage,
+                task,
+                number(value, size),
+                color=colour,
+                ha="center",
+                va="center",
+                fontsize=8.5,
+            )
+        for task in range(count):
+            if np.isnan(cells[task, task + 1]):
+                continue
+            axes.add_patch(
+                Rectangle(
+                    (task + 0.5, task - 0.5),
+                    1,
+                    1,
+                    fill=False,
+                    edgecolor="#D55E00",
+                    linewidth=2,
+                )
+            )
+    for axes in panels[len(lines) :]:
+        axes.set_axis_off()
+    if image is not None:
+        figure.colorbar(
+            image, ax=panels, label="return, mean over seeds", aspect=20 * rows
+        )
+    _entitle(figure, title, "framed: right after own training")
+    figure.savefig(path)
+
+
+def _figure(
+    size: tuple[float, float], rows: int, columns: int
+) -> tuple[Figure, list[Axes]]:
+    """A figure of its own: `pyplot` would keep state between calls."""
+    figure = Figure(figsize=size, dpi=130, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def _entitle(figure: Figure, title: str, reading: str) -> None:
+    lines = textwrap.wrap(title, width=int(11 * figure.get_figwidth()))
+    figure.suptitle("\n".join([*lines, reading]))
+
+
+def _look(i: int) -> dict[str, Any]:
+    style = _STYLES[i // len(_COLOURS) % len(_STYLES)]
+    return {"color": _COLOURS[i % len(_COLOURS)], "linestyle": style}
+
+
+def _draw_curve(axes: Axes, i: int, line: Line, budget: int, alpha: float) -> None:
+    """A method's curve, a piece for each task, and its evaluations at the borders."""
+    look = _look(i)
+    colour = look["color"]
+    scores = mean(line.scores)
+    for stage, (x, returns) in enumerate(line.curve):
+        middle = mean(returns)
+        there = ~np.isnan(middle)
+        x = x[there] + stage * budget
+        if x.size:
+            low = np.nanmin(returns[:, there], axis=0)
+            high = np.nanmax(returns[:, there], axis=0)
+            axes.fill_between(x, low, high, color=colour, alpha=alpha, linewidth=0)
+            # A single point makes no line: its marker shows it.
+            marker = "." if x.size == 1 else ""
+            axes.plot(
+                x,
+                middle[there],
+                color=colour,
+                linestyle=look["linestyle"],
+                linewidth=1.8,
+                marker=marker,
+            )
+        # Beside the border, and beside the other methods' markers.
+        inset = (0.02 + 0.025 * i) * budget
+        ends = (
+            (stage * budget + inset, stage, "none"),
+            ((stage + 1) * budget - inset, stage + 1, "full"),
+        )
+        for at, row, fill in ends:
+            axes.plot(
+                at,
+                scores[row, stage],
+                color=colour,
+                marker="o",
+                markersize=6,
+                fillstyle=fill,
+                linestyle="none",
+                zorder=3,
+            )

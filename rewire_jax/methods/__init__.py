@@ -1,0 +1,44 @@
+"""The methods by name."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rewire_jax.errors import UserError
+from rewire_jax.methods import finetune
+from rewire_jax.methods import rewire as rewiring
+from rewire_jax.methods.base import Method, Spec
+
+
+class Entry(NamedTuple):
+    """How a method is made.
+
+    Attributes:
+      make: `(spec, settings) -> Method`.
+      settings: its settings class, made with `config.settings`; `checked()` gives
+        settings ready to use or raises `UserError`.
+      preset: `(scenario name, number of distinct tasks) -> settings`.
+    """
+
+    make: Callable[[Spec, Any], Method]
+    settings: type
+    preset: Callable[[str, int], Any]
+
+
+METHODS: dict[str, Entry] = {
+    "ft1": Entry(finetune.ft1, finetune.Ft1Settings, finetune.preset),
+    "rewire": Entry(rewiring.rewire, rewiring.RewireSettings, rewiring.preset),
+}
+
+
+def register_method(name: str, entry: Entry) -> None:
+    """Adds a method of one's own, usable by name wherever the others are."""
+    METHODS[name] = entry
+
+
+def find_method(name: str) -> Entry:
+    """The method of that name; `UserError` if there is none."""
+    if name not in METHODS:
+        raise UserError(
+            f"unknown method {name!r}: choose one of {', '.join(sorted(METHODS))}"
+        )
+    return METHODS[name]

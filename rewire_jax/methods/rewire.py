@@ -1,0 +1,358 @@
+"""Rewire: multi-mode wirings, their cache, distillation and alignment."""
+
+import dataclasses
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax import networks
+from rewire_jax.config import require, settings, static, traced
+from rewire_jax.methods import wiring
+from rewire_jax.methods.base import Candidates, Method, Spec, count
+from rewire_jax.networks import Linear
+
+# The authors' distillation sums over both states of each of 256 transitions, and
+# the published alpha belongs to that sum.
+DISTILLED_STATES = 512
+
+
+@settings
+class RewireSettings:
+    """The rewiring method.
+
+    Attributes:
+      modes: K, wirings learned side by side (Eq. 5).
+      mode_slots: places for modes in memory, at least `modes`; 0 stands for it.
+      alpha: weight of the distillation between modes, on the published scale: of
+        its sum over 512 states.
+      distillation: "kl" is Eq. 6; "squares" the authors' sum of squared
+        differences of mean and log-std.
+      beta: weight of the alignment loss, or of L2 where alignment is off.
+      alignment: "norm" is Eq. 11; "expanded" the authors' form of it, whose
+        gradient in the adapters differs.
+      tau: temperature of the wirings' relaxation (Eq. 4).
+      adapter_tau: the same for the adapters.
+      noise: scale of Gumbel noise on the scores in updates.
+      dropout: share of each hidden layer's output dropped in training.
+      mode_rate: the learning rate of scores is multiplied by K: "step" scales the
+        step as the paper has it, "gradient" the gradient as the authors' code,
+        which Adam all but undoes.
+      head_slots: output heads and cached orders; task t uses slot t mod this, so
+        that a repeated task finds its own again.
+    """
+
+    modes: int = traced(3)
+    mode_slots: int = 0
+    alpha: float = 1e-5
+    distillation: Literal["kl", "squares"] = "kl"
+    beta: float = 1.0
+    alignment: Literal["norm", "expanded"] = "norm"
+    tau: float = 1.0
+    adapter_tau: float = 0.1
+    noise: float = 0.1
+    dropout: float = static(0.0)
+    mode_rate: Literal["step", "gradient"] = "step"
+    head_slots: int = 4
+
+    def checked(self) -> "RewireSettings":
+        """The settings with their places counted; `UserError` if they make no sense."""
+        require(self.modes >= 1, f"--modes must be at least 1, not {self.modes}")
+        require(
+            self.mode_slots == 0 or self.mode_slots >= self.modes,
+            f"--mode-slots {self.mode_slots} has no place for --modes {self.modes}",
+        )
+        require(self.head_slots >= 1, "--head-slots must be at least 1")
+        for name in ("alpha", "beta", "noise"):
+            value = getattr(self, name)
+            require(0 <= value < jnp.inf, f"--{name} must be at least 0, not {value}")
+        require(0 <= self.dropout < 1, "--dropout must lie in [0, 1)")
+        for name in ("tau", "adapter_tau"):
+            value = getattr(self, name)
+            flag = name.replace("_", "-")
+            require(0 < value < jnp.inf, f"--{flag} must be above 0, not {value}")
+        return dataclasses.replace(self, mode_slots=self.mode_slots or self.modes)
+
+
+# Scenario: tau, noise, alpha, beta, head slots. Published with the authors' code.
+_PUBLISHED = {
+    "halfcheetah/forgetting": (1.0, 0.1, 1e-5, 100.0, 4),
+    "halfcheetah/transfer": (0.1, 0.0, 1e-5, 0.1, 4),
+    "halfcheetah/robustness": (0.1, 0.0, 1e-5, 1.0, 2),
+    "halfcheetah/compositionality": (1.0, 0.1, 1e-5, 10.0, 4),
+    "ant/forgetting": (0.1, 0.0, 1e-5, 10.0, 4),
+    "ant/transfer": (0.1, 0.0, 1e-5, 0.1, 4),
+    "ant/robustness": (0.1, 0.0, 1e-5, 0.1, 2),
+    "ant/compositionality": (0.1, 0.0, 1e-5, 1.0, 4),
+    "humanoid/hard": (0.1, 0.1, 1e-6, 0.0, 4),
+}
+
+
+def preset(scenario: str, distinct: int) -> RewireSettings:
+    """Published settings, or the defaults with a head for each distinct task."""
+    if scenario not in _PUBLISHED:
+        return RewireSettings(head_slots=distinct)
+    tau, noise, alpha, beta, slots = _PUBLISHED[scenario]
+    return RewireSettings(
+        tau=tau,
+        noise=noise,
+        dropout=0.0 if noise else 0.1,
+        alpha=alpha,
+        beta=beta,
+        head_slots=slots,
+    )
+
+
+class Params(NamedTuple):
+    """What is trained.
+
+    Attributes:
+      hidden: L layers.
+      heads: output layers, stacked on a leading axis `[slots]`.
+      scores: `[modes, L, n]`, one wiring a mode.
+      adapters: alignment of the previous weights with `hidden`.
+    """
+
+    hidden: tuple[Linear, ...]
+    heads: Linear
+    scores: jax.Array
+    adapters: wiring.Adapters
+
+
+class Memory(NamedTuple):
+    """What is kept from task to task.
+
+    Attributes:
+      learned: `[]` int32, finished tasks.
+      previous: hidden layers at the end of the previous task.
+      head: the current task's head as it was when the task began.
+      orders: `[slots, L, n]` int32, the cached wirings.
+    """
+
+    learned: jax.Array
+    previous: tuple[Linear, ...]
+    head: Linear
+    orders: jax.Array
+
+
+class Context(NamedTuple):
+    """A draw for one update or one acting step, shared by all layers.
+
+    Attributes:
+      mode: `[]` int, the wiring to use.
+      noise: `[L, n]`, added to its scores.
+      key: for dropout, and for the mode to distil from.
+    """
+
+    mode: jax.Array
+    noise: jax.Array
+    key: jax.Array
+
+
+def rewire(spec: Spec, options: RewireSettings) -> Method:
+    """The method of the paper."""
+    n, depth = spec.hidden, spec.depth
+    slots = min(options.head_slots, spec.tasks)
+    places = options.mode_slots
+    modes = jnp.asarray(options.modes)
+
+    def init(key):
+        hidden_key, head_key = jax.random.split(key)
+        hidden = networks.init_mlp(hidden_key, [spec.observations, *[n] * depth])
+        head = networks.init_linear(head_key, n, 2 * spec.actions)
+        orders = jnp.tile(jnp.arange(n, dtype=jnp.int32), (slots, depth, 1))
+        params = Params(
+            hidden=hidden,
+            heads=_tile(head, slots),
+            scores=_tile(wiring.spread(orders[0]), places),
+            adapters=wiring.identity_adapters(depth, n),
+        )
+        return params, Memory(jnp.zeros((), jnp.int32), hidden, head, orders)
+
+    def known_slot(memory, task):
+        # A task that has not been seen has the latest slot, or its earlier round's.
+        latest = jnp.maximum(memory.learned - 1, 0)
+        return jnp.where(
+            memory.learned >= slots, task % slots, jnp.minimum(task, latest)
+        )
+
+    def start_task(key, params, memory, task):
+        del key
+        source = known_slot(memory, task)
+        head = _at(params.heads, source)
+        return Params(
+            hidden=params.hidden,
+            heads=_put(params.heads, task % slots, head),
+            scores=_tile(wiring.spread(memory.orders[source]), places),
+            adapters=wiring.identity_adapters(depth, n),
+        ), memory._replace(head=head)
+
+    def context(key, memory, learning):
+        mode_key, noise_key, key = jax.random.split(key, 3)
+        mode = jax.random.randint(mode_key, (), 0, modes)
+        noise = jnp.zeros((depth, n))
+        if learning:
+            noise = options.noise * jax.random.gumbel(noise_key, (depth, n))
+        return Context(mode, noise, key)
+
+    def forward(params, memory, scores, key, observation):
+        x = observation
+        for layer in wiring.wire(params.hidden, scores, options.tau):
+            key, drop_key = jax.random.split(key)
+            x = networks.affine(layer, x)
+            # The authors drop out before the permutation; its entries are exchangeable.
+            x = _dropout(drop_key, x, options.dropout)
+            x = networks.activate(x)
+        head = _at(params.heads, memory.learned % slots)
+        return networks.gaussian(networks.affine(head, x))
+
+    def scores_of(params, mode):
+        scores = params.scores[mode]
+        if options.mode_rate == "gradient":
+            scores = scores * modes - jax.lax.stop_gradient(scores * (modes - 1))
+        return scores
+
+    def distribution(params, memory, context, observation):
+        scores = scores_of(params, context.mode) + context.noise
+        return forward(params, memory, scores, context.key, observation)
+
+    def penalty(key, params, memory, context, observation, gaussian):
+        other_key, drop_key = jax.random.split(key)
+        offset = jax.random.randint(other_key, (), 1, jnp.maximum(modes, 2))
+        other = jax.lax.stop_gradient(
+            forward(
+                params,
+                memory,
+                params.scores[(context.mode + offset) % modes],
+                drop_key,
+                observation,
+            )
+        )
+        divergence = _DIVERGENCES[options.distillation](other, gaussian)
+        distillation = jnp.where(modes > 1, jnp.mean(divergence), 0.0)
+        alignment = wiring.alignment_loss(
+            params.hidden,
+            memory.previous,
+            params.adapters,
+            options.adapter_tau,
+            expanded=options.alignment == "expanded",
+        )
+        alignment = jnp.where(memory.learned > 0, alignment, 0.0)
+        loss = options.alpha * DISTILLED_STATES * distillation
+        return loss + options.beta * alignment, {
+            "distillation": distillation,
+            "alignment": alignment,
+        }
+
+    def adjust_updates(updates, memory):
+        del memory
+        if options.mode_rate == "gradient":
+            return updates
+        return updates._replace(scores=updates.scores * modes)
+
+    def candidates(params, memory, task):
+        del task
+        head = _at(params.heads, memory.learned % slots)
+
+        def policy(scores):
+            orders = jnp.argsort(scores, axis=-1)
+            return [*wiring.fold(params.hidden, orders), head]
+
+        return Candidates(jax.vmap(policy)(params.scores), jnp.arange(places) < modes)
+
+    def end_task(params, memory, task, selection):
+        order = jnp.argsort(params.scores[0], axis=-1)
+        failed = jnp.asarray(False)
+        if selection is not None:
+            valid = jnp.arange(places) < modes
+            after = jnp.where(valid, selection.after, -jnp.inf)
+            before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / modes
+            order = jnp.argsort(params.scores[jnp.argmax(after)], axis=-1)
+            failed = (memory.learned > 0) & (jnp.max(after) < before)
+        began = Params(
+            hidden=memory.previous,
+            heads=_put(params.heads, task % slots, memory.head),
+            scores=params.scores,
+            adapters=wiring.identity_adapters(depth, n),
+        )
+        params = jax.tree.map(lambda a, b: jnp.where(failed, a, b), began, params)
+        order = jnp.where(failed, memory.orders[known_slot(memory, task)], order)
+        refined = wiring.refine(memory.orders, params.adapters)
+        # Before the first task there is nothing the weights could be aligned with.
+        refined = jnp.where(memory.learned > 0, refined, memory.orders)
+        order = order.astype(refined.dtype)
+        return Params(
+            hidden=params.hidden,
+            heads=params.heads,
+            scores=_tile(wiring.spread(order), places),
+            adapters=wiring.identity_adapters(depth, n),
+        ), Memory(
+            learned=memory.learned + 1,
+            previous=params.hidden,
+            head=memory.head,
+            orders=refined.at[task % slots].set(order),
+        )
+
+    def policy(params, memory, task):
+        slot = known_slot(memory, task)
+        folded = wiring.fold(params.hidden, memory.orders[slot])
+        return [*folded, _at(params.heads, slot)]
+
+    def size(params, memory):
+        one_mode = depth * n
+        stored = count(params) - (places - modes) * one_mode
+        return stored + count(memory.previous) + count(memory.head) + memory.orders.size
+
+    return Method(
+        init=init,
+        start_task=start_task,
+        context=context,
+        distribution=distribution,
+        penalty=penalty,
+        adjust_updates=adjust_updates,
+        candidates=candidates,
+        end_task=end_task,
+        policy=policy,
+        act=networks.mlp_policy,
+        size=size,
+    )
+
+
+def gaussian_kl(p, q) -> jax.Array:
+    """KL(p || q) `[...]` of diagonal Gaussians given as (mean, log-std) (Eq. 6).
+
+    Squashing both by the same tanh does not change it.
+    """
+    (p_mean, p_log_std), (q_mean, q_log_std) = p, q
+    ratio = jnp.exp(2 * (p_log_std - q_log_std))
+    distance = ((p_mean - q_mean) * jnp.exp(-q_log_std)) ** 2
+    return jnp.sum(0.5 * (ratio + distance - 1) + q_log_std - p_log_std, axis=-1)
+
+
+def squared_differences(p, q) -> jax.Array:
+    """Summed squares of the differences of mean (p's within ±20) and log-std."""
+    (p_mean, p_log_std), (q_mean, q_log_std) = p, q
+    mean = (jnp.clip(p_mean, -20, 20) - q_mean) ** 2
+    return jnp.sum(mean + (p_log_std - q_log_std) ** 2, axis=-1)
+
+
+_DIVERGENCES = {"kl": gaussian_kl, "squares": squared_differences}
+
+
+def _dropout(key: jax.Array, x: jax.Array, rate: float) -> jax.Array:
+    if rate == 0:
+        return x
+    kept = jax.random.bernoulli(key, 1 - rate, x.shape)
+    return jnp.where(kept, x / (1 - rate), 0.0)
+
+
+def _tile(tree: Any, copies: int) -> Any:
+    return jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * x.ndim)), tree)
+
+
+def _at(tree: Any, index: jax.Array) -> Any:
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def _put(tree: Any, index: jax.Array, value: Any) -> Any:
+    return jax.tree.map(lambda x, v: x.at[index].set(v), tree, value)

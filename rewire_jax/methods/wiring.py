@@ -1,0 +1,128 @@
+"""Wirings: orders of hidden neurons, their cache, and alignment with the weights.
+
+A wiring of L hidden layers of n neurons is an order z `[L, n]`: layer l computes
+`activate((x @ kernel_l + bias_l)[..., z_l])` (Eq. 2, 3). Reordering a layer's output
+is reordering the columns of its weights, so a wired network is an ordinary MLP.
+
+Adapters describe how the current weights differ from the previous ones by a
+permutation: `out_l` (P'_l) of a layer's neurons, `inp_l` (P''_l) of its inputs. The
+first layer's inputs are the observation and have none.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.networks import Linear
+from rewire_jax.permutation import permute
+
+Hidden = Sequence[Linear]
+
+
+class Adapters(NamedTuple):
+    """Scores of the alignment permutations.
+
+    Attributes:
+      out: `[L, n]`, of P'.
+      inp: `[L - 1, n]`, of P'' from the second layer on.
+    """
+
+    out: jax.Array
+    inp: jax.Array
+
+
+def spread(orders: jax.Array) -> jax.Array:
+    """Evenly spaced scores in [0, 1] that sort into the given orders, `[..., n]`."""
+    ranks = jnp.argsort(orders, axis=-1)
+    return ranks / max(orders.shape[-1] - 1, 1)
+
+
+def identity_adapters(depth: int, n: int) -> Adapters:
+    """Adapters that move nothing."""
+    scores = spread(jnp.arange(n))
+    return Adapters(jnp.tile(scores, (depth, 1)), jnp.tile(scores, (depth - 1, 1)))
+
+
+def permute_outputs(layer: Linear, scores: jax.Array, tau: jax.Array) -> Linear:
+    """The layer whose output is `permute(layer's output, scores, tau)`.
+
+    Both gradients are those of permuting the output, summed over the batch, at
+    the cost of a permutation of the weights.
+    """
+    stacked = jnp.concatenate([layer.kernel, layer.bias[None]])
+    permuted = permute(stacked, scores, tau)
+    return Linear(permuted[:-1], permuted[-1])
+
+
+def wire(hidden: Hidden, scores: jax.Array, tau: jax.Array) -> list[Linear]:
+    """All hidden layers with their outputs permuted by scores `[L, n]` (Eq. 2)."""
+    return [permute_outputs(layer, v, tau) for layer, v in zip(hidden, scores)]
+
+
+def fold(hidden: Hidden, orders: jax.Array) -> list[Linear]:
+    """The same for fixed orders `[L, n]`."""
+    return [Linear(w[:, z], b[z]) for (w, b), z in zip(hidden, orders)]
+
+
+def adapt(previous: Hidden, adapters: Adapters, tau: jax.Array) -> list[Linear]:
+    """The previous layers seen through the adapters, P' W P''^T and P' b (Eq. 10)."""
+    adapted = []
+    for index, layer in enumerate(previous):
+        kernel, bias = permute_outputs(layer, adapters.out[index], tau)
+        if index > 0:
+            kernel = permute(kernel.T, adapters.inp[index - 1], tau).T
+        adapted.append(Linear(kernel, bias))
+    return adapted
+
+
+def alignment_loss(
+    hidden: Hidden,
+    previous: Hidden,
+    adapters: Adapters,
+    tau: jax.Array,
+    *,
+    expanded: bool = False,
+) -> jax.Array:
+    """L_SP, the squared distance to the adapted previous weights and biases (Eq. 11).
+
+    Args:
+      hidden: current layers.
+      previous: layers at the end of the previous task.
+      adapters: their permutation.
+      tau: temperature of the adapters' relaxation.
+      expanded: leave out the square of the adapted weights, constant under true
+        permutations but not under their relaxation (the authors' code).
+    """
+    loss = jnp.zeros(())
+    adapted = adapt(previous, adapters, tau)
+    for now, then in zip(jax.tree.leaves(hidden), jax.tree.leaves(adapted)):
+        if expanded:
+            loss += jnp.sum(now**2 - 2 * now * then)
+        else:
+            loss += jnp.sum((now - then) ** 2)
+    return loss
+
+
+def refine(orders: jax.Array, adapters: Adapters) -> jax.Array:
+    """Cached orders realigned with the current weights (Eq. 12).
+
+    If W_l = P'_l Wprev_l P''_l^T, the layer's inputs must come in the order P''_l.
+    So the layer before must end in it: its order becomes P''_{l+1} P_l P'_l^T, of
+    which `inverse(p')[z[p'']]` are the indices. No adapter follows the last layer.
+
+    Args:
+      orders: `[..., L, n]` orders for the previous weights.
+      adapters: learned adapters.
+
+    Returns:
+      `[..., L, n]` orders for the current weights.
+    """
+    undo = jnp.argsort(jnp.argsort(adapters.out, axis=-1), axis=-1)
+    follow = jnp.argsort(adapters.inp, axis=-1)
+    last = jnp.arange(orders.shape[-1])[None]
+    following = jnp.concatenate([follow, last]).astype(orders.dtype)
+    shifted = jnp.take_along_axis(orders, jnp.broadcast_to(following, orders.shape), -1)
+    refined = jnp.take_along_axis(jnp.broadcast_to(undo, orders.shape), shifted, -1)
+    return refined.astype(orders.dtype)

@@ -1,0 +1,86 @@
+"""Multi-layer perceptrons and the tanh-squashed Gaussian."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+class Linear(NamedTuple):
+    """An affine layer.
+
+    Attributes:
+      kernel: `[inputs, outputs]`.
+      bias: `[outputs]`.
+    """
+
+    kernel: jax.Array
+    bias: jax.Array
+
+
+def init_linear(key: jax.Array, inputs: int, outputs: int) -> Linear:
+    """A layer uniform in ±1/sqrt(inputs), weights and bias (PyTorch's default)."""
+    bound = inputs**-0.5
+    kernel_key, bias_key = jax.random.split(key)
+    return Linear(
+        jax.random.uniform(kernel_key, (inputs, outputs), minval=-bound, maxval=bound),
+        jax.random.uniform(bias_key, (outputs,), minval=-bound, maxval=bound),
+    )
+
+
+def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
+    """Layers `sizes[0] -> sizes[1] -> ...`, one key each."""
+    keys = jax.random.split(key, len(sizes) - 1)
+    return tuple(map(init_linear, keys, sizes[:-1], sizes[1:]))
+
+
+def activate(x: jax.Array) -> jax.Array:
+    """LeakyReLU with slope 0.2, as in all networks of the paper's experiments."""
+    return jax.nn.leaky_relu(x, 0.2)
+
+
+def affine(layer: Linear, x: jax.Array) -> jax.Array:
+    """`[..., inputs]` -> `[..., outputs]`."""
+    return x @ layer.kernel + layer.bias
+
+
+def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:
+    """Applies the layers with an activation between each two."""
+    for layer in layers[:-1]:
+        x = activate(affine(layer, x))
+    return affine(layers[-1], x)
+
+
+def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Splits `[..., 2 * actions]` into mean and clipped log-std, `[..., actions]`."""
+    mean, log_std = jnp.split(output, 2, axis=-1)
+    return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
+
+
+def mlp_policy(layers: Sequence[Linear], observation: jax.Array):
+    """Mean and log-std, each `[..., actions]`, of a plain MLP policy."""
+    return gaussian(mlp(layers, observation))
+
+
+def sample_action(
+    key: jax.Array, mean: jax.Array, log_std: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """A reparameterised action tanh(N(mean, std)) and its log-density.
+
+    Args:
+      key: a random key.
+      mean: `[..., actions]`, before the squashing.
+      log_std: `[..., actions]`.
+
+    Returns:
+      action `[..., actions]` in (-1, 1) and log-density `[...]` (arXiv 1812.05905,
+      appendix C, with log(1 - tanh²u) written as 2(log 2 - u - softplus(-2u))).
+    """
+    noise = jax.random.normal(key, mean.shape, mean.dtype)
+    raw = mean + jnp.exp(log_std) * noise
+    log_density = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
+    squash = 2 * (jnp.log(2.0) - raw - jax.nn.softplus(-2 * raw))
+    return jnp.tanh(raw), jnp.sum(log_density - squash, axis=-1)

@@ -1,0 +1,160 @@
+"""A live display of a run in the terminal; plain lines where there is none."""
+
+import math
+import sys
+from collections.abc import Sequence
+from datetime import timedelta
+from types import TracebackType
+from typing import Self, TextIO
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+_MOST_SEEDS = 6  # with more, their returns are shown as mean and range
+
+
+class Progress:
+    """Shows where a run is; used as a context manager.
+
+    Without a terminal nothing is written but a line for each finished task and for
+    each message, without control codes.
+
+    Args:
+        tasks: names of the whole sequence.
+        total: interactions a task.
+        seeds: in the order of the returns given later.
+        label: what is running, such as method and scenario.
+        file: where to write, by default the standard error output.
+        console: used instead of one made for `file`.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[str],
+        total: int,
+        seeds: Sequence[int],
+        label: str,
+        file: TextIO | None = None,
+        *,
+        console: Console | None = None,
+    ) -> None:
+        self._tasks = tuple(tasks)
+        self._total = total
+        self._seeds = tuple(seeds)
+        self._label = label
+        self._console = console or Console(file=file or sys.stderr)
+        self._live: Live | None = None
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal and not self._console.is_dumb_terminal:
+            # Refreshed by `update` alone: a thread of its own would take from training.
+            self._live = Live(
+                Text(f"{self._label}: starting"),
+                console=self._console,
+                auto_refresh=False,
+                transient=True,
+            )
+            self._live.start(refresh=True)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def update(
+        self,
+        stage: int,
+        interactions: int,
+        returns: Sequence[float | None],
+        rate: float,
+        seconds_left: float | None = None,
+        note: str | None = None,
+    ) -> None:
+        """Shows the state after a chunk; does nothing without a terminal.
+
+        Args:
+            stage: index of the task in training.
+            interactions: made in this task, for each seed.
+            returns: latest training return of each seed, None where there is none yet.
+            rate: interactions/s of all seeds together.
+            seconds_left: of the whole run, None where it cannot be told yet.
+            note: anything else, such as "evaluating".
+        """
+        if self._live is None:
+            return
+        task = Table.grid(padding=(0, 2))
+        task.add_row(
+            Text(self._name(stage), style="bold"),
+            ProgressBar(self._total, interactions, width=24),
+            Text(f"{interactions:,} / {self._total:,} interactions"),
+        )
+        speed = [f"{rate:,.0f} interactions/s"]
+        if seconds_left is not None:
+            speed.append(f"{_clock(seconds_left)} left")
+        if note:
+            speed.append(note)
+        self._live.update(
+            Group(
+                Text(self._label),
+                task,
+                Text(f"return  {self._returns(returns)}"),
+                Text("   ".join(speed)),
+            ),
+            refresh=True,
+        )
+
+    def finish_task(
+        self, stage: int, returns: Sequence[float | None], seconds: float
+    ) -> None:
+        """Prints the line of a finished task.
+
+        Args:
+            stage: index of the task.
+            returns: evaluation return of each seed on this task.
+            seconds: what the task took.
+        """
+        self.message(
+            f"{self._label}: {self._name(stage)} finished in {_clock(seconds)}, "
+            f"return {self._returns(returns)}"
+        )
+
+    def message(self, text: str) -> None:
+        """Prints a line, above the live display where there is one."""
+        self._console.print(Text(text), soft_wrap=True)
+
+    def _name(self, stage: int) -> str:
+        return f"task {stage + 1} of {len(self._tasks)}, {self._tasks[stage]}"
+
+    def _returns(self, returns: Sequence[float | None]) -> str:
+        """One return a seed, or their mean and range."""
+        if len(returns) <= _MOST_SEEDS:
+            pairs = zip(self._seeds, returns, strict=True)
+            return "  ".join(f"seed {seed}: {_number(x)}" for seed, x in pairs)
+        known = [x for x in returns if x is not None and math.isfinite(x)]
+        if not known:
+            return _number(None)
+        missing = len(returns) - len(known)
+        return (
+            f"mean {_number(sum(known) / len(known))}, "
+            f"{_number(min(known))} to {_number(max(known))} in {len(known)} seeds"
+            + (f", none in {missing}" if missing else "")
+        )
+
+
+def _number(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.1f}"
+
+
+def _clock(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))

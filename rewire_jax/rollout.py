@@ -1,0 +1,142 @@
+"""Acting in environments: training steps with fresh starts, and whole episodes."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.envs.base import Environment, State, Task
+
+
+class Episode(NamedTuple):
+    """One environment in training.
+
+    Attributes:
+      state: its current state.
+      start: the state every further episode starts from.
+      steps: `[]` int32, of the current episode.
+      score: `[]`, return of the current episode so far.
+    """
+
+    state: State
+    start: State
+    steps: jax.Array
+    score: jax.Array
+
+
+class Step(NamedTuple):
+    """What one environment step gave.
+
+    Attributes:
+      reward: `[]`.
+      terminal: `[]` bool, ended by the task.
+      truncated: `[]` bool, ended by the time limit alone.
+      last: `[observations]`, what the step led to.
+      following: `[observations]`, the same or a fresh start's.
+      score: `[]`, return of the episode so far.
+    """
+
+    reward: jax.Array
+    terminal: jax.Array
+    truncated: jax.Array
+    last: jax.Array
+    following: jax.Array
+    score: jax.Array
+
+
+class Rollout(NamedTuple):
+    """Whole episodes, `[..., episodes]` each: returns and lengths in steps."""
+
+    returns: jax.Array
+    lengths: jax.Array
+
+
+def begin(environment: Environment, task: Task, key: jax.Array) -> Episode:
+    """An environment at the start of an episode."""
+    state = environment.reset(task, key)
+    return Episode(state, state, jnp.zeros((), jnp.int32), jnp.zeros(()))
+
+
+def advance(
+    environment: Environment, task: Task, episode: Episode, action: jax.Array
+) -> tuple[Episode, Step]:
+    """Steps one environment; an ended episode returns to its own start.
+
+    Returning to a stored start, as brax's wrapper does, saves a reset in every
+    step; the starts differ between environments and tasks.
+    """
+    state = environment.step(task, episode.state, action)
+    steps = episode.steps + 1
+    score = episode.score + state.reward
+    truncated = (steps >= environment.episode_length) & ~state.terminal
+    ended = state.terminal | truncated
+    after = jax.tree.map(lambda a, b: jnp.where(ended, a, b), episode.start, state)
+    return Episode(
+        state=after,
+        start=episode.start,
+        steps=jnp.where(ended, 0, steps),
+        score=jnp.where(ended, 0.0, score),
+    ), Step(
+        reward=state.reward,
+        terminal=state.terminal,
+        truncated=truncated,
+        last=state.observation,
+        following=after.observation,
+        score=score,
+    )
+
+
+def episodes(
+    environment: Environment,
+    act: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    tasks: Task,
+    policies: Any,
+    keys: jax.Array,
+    count: int,
+) -> Rollout:
+    """Plays whole episodes without exploration: action = tanh(mean).
+
+    Args:
+      environment: unbatched.
+      act: `(policy, observation) -> mean, log_std`.
+      tasks: pytree with a leading axis `[rows]`.
+      policies: pytree with leading axes `[members, rows]`.
+      keys: `[members, rows]`.
+      count: episodes for each member and row.
+
+    Returns:
+      `[members, rows, count]`.
+    """
+
+    def over(function: Callable) -> Callable:
+        # Members, rows, episodes; a task is shared by members, a policy by episodes.
+        function = jax.vmap(function, (None, None, 0))
+        return jax.vmap(jax.vmap(function), (None, 0, 0))
+
+    def reset(task, policy, key):
+        return environment.reset(task, key)
+
+    def step(task, policy, state):
+        mean, _ = act(policy, state.observation)
+        return environment.step(task, state, jnp.tanh(mean))
+
+    def body(carry):
+        time, state, alive, result = carry
+        state = over(step)(tasks, policies, state)
+        result = Rollout(
+            result.returns + jnp.where(alive, state.reward, 0.0),
+            result.lengths + alive,
+        )
+        return time + 1, state, alive & ~state.terminal, result
+
+    def unfinished(carry):
+        time, _, alive, _ = carry
+        return (time < environment.episode_length) & jnp.any(alive)
+
+    split = jax.vmap(jax.vmap(lambda key: jax.random.split(key, count)))(keys)
+    state = over(reset)(tasks, policies, split)
+    shape = (*keys.shape, count)
+    result = Rollout(jnp.zeros(shape), jnp.zeros(shape, jnp.int32))
+    carry = (jnp.zeros((), jnp.int32), state, jnp.ones(shape, bool), result)
+    return jax.lax.while_loop(unfinished, body, carry)[-1]

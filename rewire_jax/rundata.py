@@ -1,0 +1,227 @@
+"""Reads the result files of a run folder, finished or not, into arrays."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rewire_jax.errors import UserError
+
+_T = TypeVar("_T")
+Array = NDArray[np.float64]
+_NEEDED = ("scenario", "method", "profile", "backend", "interactions")
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What a run has written so far.
+
+    Attributes:
+        folder: the run folder.
+        settings: the resolved settings saved with the run.
+        tasks: names of the whole sequence, T of them.
+        provenance: command, commit, versions, device and start time.
+        seeds: the S seeds that have results.
+        diverged: those among them that were marked as diverged.
+        before: evaluation returns before any training, `[S, T]`, NaN where missing.
+        scores: evaluation returns `[S, T stages, T tasks]`, NaN where missing.
+        finished: number of leading stages that are evaluated for all tasks and seeds.
+        model_size: numbers stored ÷ those of one policy, the maximum over the run.
+        training: interactions spent on training, a seed.
+        selection: interactions spent on choosing and rolling back, a seed.
+        curve: per stage, interactions within the task `[points]` and training returns
+            `[S, points]`, NaN where no episode ended.
+        rate: training interactions of all seeds per second, without the chunks that
+            compiled; None where there is no other chunk.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    tasks: tuple[str, ...]
+    provenance: dict[str, Any]
+    seeds: tuple[int, ...]
+    diverged: tuple[int, ...]
+    before: Array
+    scores: Array
+    finished: int
+    model_size: float
+    training: int
+    selection: int
+    curve: tuple[tuple[Array, Array], ...]
+    rate: float | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every task has been trained and evaluated."""
+        return self.finished == len(self.tasks)
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        """`[S]`: the seeds that count, which are those that did not diverge."""
+        return np.array([seed not in self.diverged for seed in self.seeds], bool)
+
+
+def read_run(folder: str | Path) -> RunData:
+    """Reads a run from its folder alone.
+
+    The last line of a table may have been cut by a crash and is then ignored. A row
+    written again by a resumed run replaces the earlier one.
+
+    Args:
+        folder: holds `settings.json`, `results.jsonl` and, once training has begun,
+            `training.jsonl` and `timing.jsonl`.
+
+    Raises:
+        UserError: a file is missing, or damaged elsewhere than in its last line.
+    """
+    folder = Path(folder)
+    settings, tasks, provenance = _head(folder / "settings.json")
+    results = _table(folder / "results.jsonl", lambda row: _result(row, len(tasks)))
+    if not results:
+        raise UserError(f"{folder / 'results.jsonl'} holds no results yet")
+    seeds = sorted({seed for _, _, seed in results})
+    place = {seed: i for i, seed in enumerate(seeds)}
+    # One row of `everything` more than there are stages: the first is "before".
+    everything = np.full((len(seeds), len(tasks) + 1, len(tasks)), np.nan)
+    seen = np.zeros(everything.shape, bool)
+    for (stage, task, seed), row in results.items():
+        everything[place[seed], stage + 1, task] = row["return"]
+        seen[place[seed], stage + 1, task] = True
+    whole = seen.all(axis=(0, 2))
+    finished = int(np.cumprod(whole)[1:].sum())
+    spent = [row["interactions"] for row in results.values()]
+    began = finished > 0
+    return RunData(
+        folder=folder,
+        settings=settings,
+        tasks=tasks,
+        provenance=provenance,
+        seeds=tuple(seeds),
+        diverged=tuple(sorted({k[2] for k, row in results.items() if row["diverged"]})),
+        before=everything[:, 0],
+        scores=everything[:, 1:],
+        finished=finished,
+        model_size=max(row["model_size"] for row in results.values()),
+        # Equal for all seeds but those that stopped early because they diverged.
+        training=max(training for training, _ in spent),
+        selection=max(selection for _, selection in spent),
+        curve=_curve(folder / "training.jsonl", len(tasks), place, began),
+        rate=_rate(folder / "timing.jsonl", len(tasks), len(seeds), began),
+    )
+
+
+def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any]]:
+    """Settings, tasks and provenance from `settings.json`."""
+    try:
+        head = json.loads(_text(path))
+        settings, provenance = dict(head["settings"]), dict(head["provenance"])
+        tasks = tuple(str(name) for name in head["tasks"])
+        missing = [name for name in _NEEDED if name not in settings]
+    except (ValueError, TypeError, KeyError) as error:
+        raise UserError(f"{path} is damaged ({_reason(error)})") from None
+    if missing or not tasks:
+        raise UserError(f"{path} lacks {', '.join(missing) or 'tasks'}")
+    return settings, tasks, provenance
+
+
+def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str, Any]]:
+    """Key (stage, task, seed) and checked values of a row of `results.jsonl`."""
+    stage, task = _index(row, "stage", -1, tasks), _index(row, "task", 0, tasks)
+    spent = row["interactions"]
+    return (stage, task, int(row["seed"])), {
+        "return": _number(row["return"]),
+        "diverged": bool(row["diverged"]),
+        "model_size": float(row["model_size"]),
+        "interactions": (int(spent["training"]), int(spent["selection"])),
+    }
+
+
+def _curve(
+    path: Path, tasks: int, place: dict[int, int], began: bool
+) -> tuple[tuple[Array, Array], ...]:
+    """Training returns per stage, see `RunData.curve`."""
+
+    def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
+        at = _index(row, "stage", 0, tasks), int(row["interactions"])
+        return (*at, place[row["seed"]]), _number(row["return"])
+
+    rows = _table(path, parse, needed=began)
+    curve = []
+    for stage in range(tasks):
+        points = sorted({key[1] for key in rows if key[0] == stage})
+        column = {x: i for i, x in enumerate(points)}
+        returns = np.full((len(place), len(points)), np.nan)
+        for (at, x, seed), value in rows.items():
+            if at == stage:
+                returns[seed, column[x]] = value
+        curve.append((np.array(points, np.float64), returns))
+    return tuple(curve)
+
+
+def _rate(path: Path, tasks: int, seeds: int, began: bool) -> float | None:
+    """Training interactions of all seeds per second, see `RunData.rate`."""
+
+    def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[float, bool]]:
+        at = _index(row, "stage", 0, tasks), int(row["interactions"])
+        return at, (float(row["seconds"]), bool(row["compile"]))
+
+    interactions, seconds, last = 0, 0.0, (0, 0)
+    rows = _table(path, parse, needed=began)
+    for (stage, x), (took, compiled) in sorted(rows.items()):
+        if not compiled:
+            # Rows count from the task's start: a chunk is what came on top.
+            interactions += x - (last[1] if last[0] == stage else 0)
+            seconds += took
+        last = (stage, x)
+    return seeds * interactions / seconds if seconds > 0 else None
+
+
+def _table(
+    path: Path,
+    parse: Callable[[dict[str, Any]], tuple[tuple[int, ...], _T]],
+    *,
+    needed: bool = True,
+) -> dict[tuple[int, ...], _T]:
+    """Rows of a JSON-lines file by key; later rows replace earlier ones."""
+    if not needed and not path.exists():
+        return {}
+    lines = _text(path).split("\n")
+    table = {}
+    # What follows the last line break is empty, or a line that was cut.
+    for number, line in enumerate(lines[:-1], 1):
+        try:
+            key, value = parse(json.loads(line))
+        except (ValueError, TypeError, KeyError) as error:
+            reason = _reason(error)
+            raise UserError(f"{path}, line {number} is damaged ({reason})") from None
+        table[key] = value
+    return table
+
+
+def _text(path: Path) -> str:
+    try:
+        # A crash may cut inside a character; JSON then refuses the line as it should.
+        return path.read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        raise UserError(f"{path} is missing: not the folder of a run") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+
+
+def _index(row: dict[str, Any], name: str, low: int, high: int) -> int:
+    value = int(row[name])
+    if not low <= value < high:
+        raise ValueError(f"{name} {value} is not in {low} to {high - 1}")
+    return value
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _reason(error: Exception) -> str:
+    return f"no {error}" if isinstance(error, KeyError) else str(error)

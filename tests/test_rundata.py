@@ -1,0 +1,62 @@
+"""Run folders as crashes, resumed runs and damage leave them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_run import replace_line, write_run
+
+from rewire_jax.errors import UserError
+from rewire_jax.rundata import read_run
+
+
+def test_cut_last_lines_are_ignored(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    whole = read_run(run)
+    for name in ("results", "training", "timing"):
+        with (run / f"{name}.jsonl").open("ab") as file:
+            file.write('{"stage": 2, "return": 1 "é'.encode()[:-1])
+    cut = read_run(run)
+    np.testing.assert_array_equal(cut.scores, whole.scores)
+    assert cut.rate == whole.rate
+    assert cut.complete
+
+
+@pytest.mark.parametrize("name", ["results", "training", "timing"])
+@pytest.mark.parametrize(
+    "text", ['{"stage": 0, "ta', "7", '{"stage": 9, "task": 0}', "{}", ""]
+)
+def test_damaged_line_is_named(tmp_path: Path, name: str, text: str) -> None:
+    path = write_run(tmp_path / "run") / f"{name}.jsonl"
+    replace_line(path, 4, text)
+    with pytest.raises(UserError, match=f"{name}.jsonl, line 4 is damaged") as error:
+        read_run(path.parent)
+    assert "\n" not in str(error.value)
+
+
+def test_damaged_settings(tmp_path: Path) -> None:
+    path = write_run(tmp_path / "run") / "settings.json"
+    path.write_text(path.read_text().replace("backend", "back"))
+    with pytest.raises(UserError, match=r"settings\.json lacks backend"):
+        read_run(path.parent)
+    path.write_text(path.read_text()[:50])
+    with pytest.raises(UserError, match=r"settings\.json is damaged"):
+        read_run(path.parent)
+
+
+def test_half_written_stage_does_not_count(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    path = run / "results.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+    assert read_run(run).finished == 2
+
+
+def test_rewritten_rows_replace_earlier_ones(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    whole = read_run(run)
+    for name in ("results", "training", "timing"):
+        path = run / f"{name}.jsonl"
+        path.write_text(path.read_text() * 2)
+    again = read_run(run)
+    np.testing.assert_array_equal(again.scores, whole.scores)
+    assert again.rate == whole.rate
