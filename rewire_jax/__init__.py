@@ -1,1 +1,44 @@
-"""Continual reinforcement learning by rewiring neurons, in JAX."""
+"""Continual reinforcement learning by rewiring neurons, in JAX.
+
+Implements "Rewiring Neurons in Non-Stationary Environments" (NeurIPS 2023) and what
+it is compared with. The README has the commands; this is the interface for Python.
+"""
+
+from rewire_jax.config import SacSettings, Settings
+from rewire_jax.continual import Stopped, train
+from rewire_jax.envs.base import TaskChange
+from rewire_jax.errors import UserError
+from rewire_jax.inspection import evaluate, info
+from rewire_jax.methods import register_method
+from rewire_jax.permutation import permute
+from rewire_jax.policy import load_policy
+from rewire_jax.presets import preset
+from rewire_jax.report import write_report
+from rewire_jax.scenarios import (
+    Scenario,
+    ScenarioSpec,
+    list_scenarios,
+    make_scenario,
+    register_scenario,
+)
+
+__all__ = [
+    "SacSettings",
+    "Scenario",
+    "ScenarioSpec",
+    "Settings",
+    "Stopped",
+    "TaskChange",
+    "UserError",
+    "evaluate",
+    "info",
+    "list_scenarios",
+    "load_policy",
+    "make_scenario",
+    "permute",
+    "preset",
+    "register_method",
+    "register_scenario",
+    "train",
+    "write_report",
+]

@@ -3,11 +3,10 @@
 A checkpoint holds named items, each a pytree of arrays in an Orbax folder of its
 own, so that a policy is read without the replay buffer beside it. `manifest.json`
 lists the leaves of each item and the size and SHA-256 of each file. All is written
-under a temporary name and renamed when it is on disk. A folder of checkpoints has
-one writer at a time.
+under a temporary name and renamed when it is on disk: give checkpoints names of
+their own, in the order of time. A folder of checkpoints has one writer at a time.
 """
 
-import ctypes
 import hashlib
 import itertools
 import json
@@ -15,7 +14,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -38,12 +37,12 @@ class CheckpointError(UserError):
 
 
 def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
-    """Writes a checkpoint; until it is done, `path` stays what it was.
+    """Writes a checkpoint; it is complete or not there.
 
     Args:
-      path: the folder to make, or to replace.
+      path: the folder to make; one that stands there gives way at the last moment.
       items: pytrees of arrays, by the name under which `load` finds them.
-      metadata: what JSON can hold; its int `order` ranks it in `available`.
+      metadata: what JSON can hold.
 
     Raises:
       UserError: the disk is full or the folder cannot be written.
@@ -51,7 +50,7 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
     """
     path = Path(path).absolute()  # Orbax refuses relative paths.
     content: dict[str, Any] = {
-        "metadata": {**metadata, "order": int(metadata["order"])},
+        "metadata": dict(metadata),
         "items": {name: [*_describe(name, tree)] for name, tree in items.items()},
     }
     temporary = path.parent / f"{_TEMPORARY}{path.name}"
@@ -70,7 +69,9 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
         (temporary / _MANIFEST).write_text(json.dumps(manifest, indent=1))
         for entry in [*temporary.rglob("*"), temporary]:
             _sync(entry)
-        _replace(temporary, path)
+        if path.exists():
+            shutil.rmtree(path)
+        temporary.rename(path)
         _sync(path.parent)
     except (OSError, ValueError) as error:  # TensorStore's are ValueErrors.
         raise UserError(
@@ -128,13 +129,16 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
 
 def available(folder: Path) -> list[Path]:
-    """Lists the checkpoints in `folder`, the highest `order` first.
-
-    Raises:
-      CheckpointError: a manifest is damaged.
-    """
+    """Lists what look like complete checkpoints in `folder`, last by name first."""
     found = (file.parent for file in Path(folder).glob(f"[!.]*/{_MANIFEST}"))
-    return sorted(found, key=lambda path: read_metadata(path)["order"], reverse=True)
+    return sorted(found, reverse=True)
+
+
+def remove(paths: Iterable[Path]) -> None:
+    """Deletes checkpoints, each out of sight before it is taken apart."""
+    for path in paths:
+        gone = path.rename(path.with_name(f"{_TEMPORARY}{path.name}"))
+        shutil.rmtree(gone, ignore_errors=True)
 
 
 def _describe(item: str, tree: Any) -> Iterator[str]:
@@ -243,22 +247,3 @@ def _sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _replace(new: Path, path: Path) -> None:
-    """Moves `new` to `path`; a folder that stood there ends at `new`."""
-    if not path.exists():
-        new.rename(path)
-        return
-    try:  # Linux swaps two folders in one step, for which Python has no name.
-        here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-        failed = ctypes.CDLL(None).renameat2(
-            here, bytes(new), here, bytes(path), exchange
-        )
-    except AttributeError:
-        failed = True
-    if failed:  # Elsewhere (NFS, macOS) there is a moment with neither.
-        aside = path.with_name(f"{_TEMPORARY}old")
-        path.rename(aside)
-        new.rename(path)
-        aside.rename(new)

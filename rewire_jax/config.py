@@ -2,9 +2,10 @@
 
 import dataclasses
 import typing
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import jax
+import tyro
 
 from rewire_jax.errors import UserError
 
@@ -115,7 +116,7 @@ class Settings:
     seeds: int = 1
     tasks: int
     interactions: int
-    paper_interactions: int
+    paper_interactions: Annotated[int, tyro.conf.Suppress]
     envs: int = 128
     updates: int = 64
     warmup: int = 12_800

@@ -109,7 +109,7 @@ def episodes(
       `[members, rows, count]`.
     """
 
-    def over(function: Callable) -> Callable:
+    def over(function: Callable[..., Any]) -> Callable[..., Any]:
         # Members, rows, episodes; a task is shared by members, a policy by episodes.
         function = jax.vmap(function, (None, None, 0))
         return jax.vmap(jax.vmap(function), (None, 0, 0))

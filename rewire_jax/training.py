@@ -11,7 +11,6 @@ from rewire_jax import networks, replay, rollout, sac
 from rewire_jax.config import SacSettings
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods.base import Candidates, Method, Selection, Spec
-from rewire_jax.population import Members
 
 
 class Shape(NamedTuple):

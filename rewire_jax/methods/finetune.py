@@ -34,8 +34,8 @@ def ft1(spec: Spec, options: Ft1Settings) -> Method:
         init=init,
         start_task=lambda key, params, memory, task: (params, memory),
         context=lambda key, memory, learning: (),
-        distribution=lambda params, memory, context, observation: (
-            networks.mlp_policy(params, observation)
+        distribution=lambda params, memory, context, observation: networks.mlp_policy(
+            params, observation
         ),
         penalty=lambda *_: (jnp.zeros(()), {}),
         adjust_updates=lambda updates, memory: updates,

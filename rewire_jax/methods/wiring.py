@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from rewire_jax.networks import Linear
 from rewire_jax.permutation import permute
@@ -45,7 +46,7 @@ def identity_adapters(depth: int, n: int) -> Adapters:
     return Adapters(jnp.tile(scores, (depth, 1)), jnp.tile(scores, (depth - 1, 1)))
 
 
-def permute_outputs(layer: Linear, scores: jax.Array, tau: jax.Array) -> Linear:
+def permute_outputs(layer: Linear, scores: jax.Array, tau: ArrayLike) -> Linear:
     """The layer whose output is `permute(layer's output, scores, tau)`.
 
     Both gradients are those of permuting the output, summed over the batch, at
@@ -56,17 +57,19 @@ def permute_outputs(layer: Linear, scores: jax.Array, tau: jax.Array) -> Linear:
     return Linear(permuted[:-1], permuted[-1])
 
 
-def wire(hidden: Hidden, scores: jax.Array, tau: jax.Array) -> list[Linear]:
+def wire(hidden: Hidden, scores: jax.Array, tau: ArrayLike) -> list[Linear]:
     """All hidden layers with their outputs permuted by scores `[L, n]` (Eq. 2)."""
-    return [permute_outputs(layer, v, tau) for layer, v in zip(hidden, scores)]
+    return [
+        permute_outputs(layer, v, tau) for layer, v in zip(hidden, scores, strict=True)
+    ]
 
 
 def fold(hidden: Hidden, orders: jax.Array) -> list[Linear]:
     """The same for fixed orders `[L, n]`."""
-    return [Linear(w[:, z], b[z]) for (w, b), z in zip(hidden, orders)]
+    return [Linear(w[:, z], b[z]) for (w, b), z in zip(hidden, orders, strict=True)]
 
 
-def adapt(previous: Hidden, adapters: Adapters, tau: jax.Array) -> list[Linear]:
+def adapt(previous: Hidden, adapters: Adapters, tau: ArrayLike) -> list[Linear]:
     """The previous layers seen through the adapters, P' W P''^T and P' b (Eq. 10)."""
     adapted = []
     for index, layer in enumerate(previous):
@@ -81,7 +84,7 @@ def alignment_loss(
     hidden: Hidden,
     previous: Hidden,
     adapters: Adapters,
-    tau: jax.Array,
+    tau: ArrayLike,
     *,
     expanded: bool = False,
 ) -> jax.Array:
@@ -97,7 +100,8 @@ def alignment_loss(
     """
     loss = jnp.zeros(())
     adapted = adapt(previous, adapters, tau)
-    for now, then in zip(jax.tree.leaves(hidden), jax.tree.leaves(adapted)):
+    leaves = zip(jax.tree.leaves(hidden), jax.tree.leaves(adapted), strict=True)
+    for now, then in leaves:
         if expanded:
             loss += jnp.sum(now**2 - 2 * now * then)
         else:

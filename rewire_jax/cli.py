@@ -1,0 +1,193 @@
+"""The `rewire-jax` command."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import tyro
+
+from rewire_jax import continual, inspection
+from rewire_jax.config import Settings, require
+from rewire_jax.errors import UserError
+from rewire_jax.methods import METHODS
+from rewire_jax.presets import preset
+from rewire_jax.scenarios import list_scenarios, make_scenario
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train:
+    """Learns the tasks of a scenario, one after the other.
+
+    Attributes:
+      settings: of the run.
+      out: folder of the run, new or empty.
+      resume: continue the run in that folder from its newest checkpoint.
+      tensorboard: write TensorBoard events too.
+    """
+
+    settings: Settings
+    out: Path
+    resume: bool = False
+    tensorboard: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluate:
+    """Plays the tasks of a run with what it has learned, without exploration.
+
+    Attributes:
+      run: folder of the run.
+      stage: as it was after this task's training; the latest if not given.
+      episodes: for each task.
+      seed: of the episodes, not of the run.
+      json: print rows as JSON instead of a table.
+    """
+
+    run: tyro.conf.Positional[Path]
+    stage: int | None = None
+    episodes: int = 128
+    seed: int = 0
+    json: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Info:
+    """Tasks, budgets, backend, and the model size of each method.
+
+    Attributes:
+      scenario: its name.
+      backend: physics backend.
+      json: print JSON instead of text.
+    """
+
+    scenario: tyro.conf.Positional[str]
+    backend: str = "positional"
+    json: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class List:
+    """Scenarios and methods.
+
+    Attributes:
+      json: print JSON instead of text.
+    """
+
+    json: bool = False
+
+
+def _train(arguments: Sequence[str]) -> None:
+    # The settings' defaults depend on these four, so they are read before the rest.
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--method", default="rewire")
+    first.add_argument("--profile", default="paper")
+    first.add_argument("--backend", default="positional")
+    known, _ = first.parse_known_args(arguments)
+    given = bool(arguments) and not arguments[0].startswith("-")
+    require(
+        given or "--help" in arguments or "-h" in arguments,
+        "train needs a scenario: see `rewire-jax list`",
+    )
+    name = arguments[0] if given else "halfcheetah/forgetting"
+    scenario = make_scenario(name, known.backend)
+    default = preset(scenario, known.method, known.profile)
+    train = tyro.cli(
+        Train,
+        prog="rewire-jax train SCENARIO",
+        args=list(arguments[1:] if given else arguments),
+        default=Train(settings=default, out=tyro.MISSING),
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    folder = continual.train(
+        train.settings,
+        train.out,
+        scenario=scenario,
+        resume=train.resume,
+        tensorboard=train.tensorboard,
+    )
+    print(f"finished: results, checkpoints and settings are in {folder}")
+
+
+def _evaluate(arguments: Sequence[str]) -> None:
+    asked = tyro.cli(Evaluate, prog="rewire-jax evaluate", args=list(arguments))
+    rows = inspection.evaluate(
+        asked.run, stage=asked.stage, episodes=asked.episodes, seed=asked.seed
+    )
+    if asked.json:
+        print("\n".join(json.dumps(row) for row in rows))
+        return
+    print(f"{'task':<28}{'seed':>6}{'return':>12}{'std':>10}{'steps':>10}")
+    for row in rows:
+        task = f"{row['task']} {row['name']}"
+        print(
+            f"{task:<28}{row['seed']:>6}{row['return']:>12.1f}{row['std']:>10.1f}"
+            f"{row['steps']:>10}"
+        )
+
+
+def _info(arguments: Sequence[str]) -> None:
+    asked = tyro.cli(Info, prog="rewire-jax info", args=list(arguments))
+    facts = inspection.info(make_scenario(asked.scenario, asked.backend))
+    if asked.json:
+        print(json.dumps(facts, indent=1))
+        return
+    print(
+        f"{facts['scenario']} on {facts['backend']}: {len(facts['tasks'])} tasks of "
+        f"{facts['interactions']:,} interactions, observation "
+        f"{facts['observation_size']}, action {facts['action_size']}"
+    )
+    for number, task in enumerate(facts["tasks"]):
+        print(f"  {number} {task['name']}")
+    print("model size, in plain policies:")
+    for method, size in facts["model_size"].items():
+        print(f"  {method:<10}{size:.2f}")
+
+
+def _list(arguments: Sequence[str]) -> None:
+    asked = tyro.cli(List, prog="rewire-jax list", args=list(arguments))
+    names = {"scenarios": list(list_scenarios()), "methods": sorted(METHODS)}
+    if asked.json:
+        print(json.dumps(names, indent=1))
+        return
+    for title, entries in names.items():
+        print(f"{title}:", *entries, sep="\n  ")
+
+
+_COMMANDS = {"train": _train, "evaluate": _evaluate, "info": _info, "list": _list}
+_USAGE = """usage: rewire-jax COMMAND ...
+
+  train SCENARIO --out RUN [--method M] [--profile P] [--resume] [--SETTING VALUE ...]
+      learn the tasks of a scenario, one after the other
+      (`rewire-jax train SCENARIO --help` lists all settings and their values)
+  evaluate RUN    play the tasks of a run with what it has learned
+  info SCENARIO   tasks, budgets, backend, and the model size of each method
+  list            scenarios and methods
+
+`rewire-jax COMMAND --help` says more.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Runs a command; exits with 2 on a user's error, 130 on an interruption."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_USAGE, end="")
+        sys.exit(0 if arguments else 2)
+    name, *rest = arguments
+    try:
+        known = ", ".join(_COMMANDS)
+        require(name in _COMMANDS, f"unknown command {name!r}: choose one of {known}")
+        _COMMANDS[name](rest)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except continual.Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

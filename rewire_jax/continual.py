@@ -1,0 +1,334 @@
+"""A continual run: task after task, evaluation, logging, checkpoints."""
+
+import signal
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax import config, runfolder, standing, training
+from rewire_jax.config import Settings
+from rewire_jax.envs.base import Task
+from rewire_jax.errors import UserError
+from rewire_jax.methods.base import Selection
+from rewire_jax.plan import Plan, base_size, prepare
+from rewire_jax.progress import Progress
+from rewire_jax.sac import Learner
+from rewire_jax.scenarios import Scenario
+from rewire_jax.standing import Standing
+from rewire_jax.tensorboard import Events
+
+# Streams of randomness beside training's, which is 1.
+_EVALUATION, _SELECTION = 2, 3
+
+
+class Stopped(Exception):
+    """The run was interrupted and can be resumed; the message says how."""
+
+
+class Run:
+    """A run in its folder. Holds paths and compiled functions, no learning state."""
+
+    def __init__(self, plan: Plan, folder: Path, events: Events, progress: Progress):
+        """See `train`."""
+        self.plan = plan
+        self.folder = folder
+        self.events = events
+        self.progress = progress
+        self.stopping = False
+
+    def start(self) -> Standing:
+        """The beginning of the run, after the evaluation of untrained policies."""
+        now = standing.start(self.plan)
+        self.evaluate(now, -1)
+        return now
+
+    def task(self, now: Standing) -> Standing:
+        """Trains what is left of a task, and concludes it."""
+        began = clock.perf_counter()
+        plan, stage = self.plan, now.stage
+        task = jax.tree.map(lambda leaf: leaf[stage], plan.tasks)
+        if now.state is None:
+            now = self.begin(now, task)
+        while now.steps < self.plan.steps:
+            now = self.chunk(now, task)
+            if self.stopping:
+                standing.save(self.folder, now)
+                raise Stopped(
+                    f"stopped and saved: continue with --resume --out {self.folder}"
+                )
+        now, returns = self.conclude(now, task)
+        standing.save(self.folder, now)
+        self.progress.finish_task(stage, returns, clock.perf_counter() - began)
+        return now
+
+    def begin(self, now: Standing, task: Task) -> Standing:
+        """Starts a task: fresh optimisers, environments and buffer."""
+        program, members, stage = self.plan.program, self.plan.members, now.stage
+        state = program.begin(members, now.learner, now.alive, stage, task)
+        now = now._replace(learner=None, state=state)
+        return self.select(now, state.learner, task, 0)
+
+    def select(
+        self, now: Standing, learner: Learner, task: Task, phase: int
+    ) -> Standing:
+        """Rolls out the method's candidates, and counts the interactions."""
+        program, settings = self.plan.program, self.plan.settings
+        if program.candidates is None or not settings.selection_episodes:
+            return now
+        candidates = program.candidates(self.plan.members, learner, now.stage)
+        number = candidates.valid.shape[1]
+        episodes = max(settings.selection_episodes // number, 1)
+        tasks = jax.tree.map(lambda leaf: jnp.stack([leaf] * number), task)
+        keys = self.keys(_SELECTION, 2 * now.stage + phase, number)
+        result = program.rollout(tasks, candidates.policies, keys, episodes)
+        used = jnp.sum(jnp.sum(result.lengths, axis=2) * candidates.valid, axis=1)
+        return now._replace(
+            before=jnp.mean(result.returns, axis=2),
+            selection=now.selection + used,
+        )
+
+    def keys(self, stream: int, number: int, rows: int) -> jax.Array:
+        """Random keys `[members, rows]` that depend on nothing but the arguments."""
+
+        def split(key):
+            key = jax.random.fold_in(jax.random.fold_in(key, stream), number)
+            return jax.random.split(key, rows)
+
+        return jax.vmap(split)(self.plan.members.keys)
+
+    def chunk(self, now: Standing, task: Task) -> Standing:
+        """Trains until the next progress report."""
+        began = clock.perf_counter()
+        plan, settings = self.plan, self.plan.settings
+        stage, done = now.stage, now.steps
+        every = max(settings.report_every // settings.envs, 1)
+        steps = min(every - done % every, self.plan.steps - done)
+        compiled = plan.program.chunk._cache_size()  # type: ignore[attr-defined]
+        state, report = plan.program.chunk(
+            plan.members, now.state, stage, task, done, steps
+        )
+        report = jax.tree.map(np.asarray, report)
+        alive = np.array(state.alive)
+        lost = now.alive & ~alive
+        for seed, is_lost in zip(plan.seeds, lost, strict=True):
+            if is_lost:
+                self.progress.message(
+                    f"seed {seed}: a value is not finite in task {stage}; its learner "
+                    "stays as it was, try lower learning rates"
+                )
+        done += steps
+        now = now._replace(steps=done, state=state, alive=alive)
+        seconds = clock.perf_counter() - began
+        compiles = plan.program.chunk._cache_size() > compiled  # type: ignore
+        self.log(now, report, seconds, compiles, steps)
+        interval = settings.checkpoint_every // settings.envs // every * every
+        due = settings.checkpoint_every and done % max(interval, every) == 0
+        if due and done < self.plan.steps:
+            standing.save(self.folder, now)
+        return now
+
+    def log(
+        self,
+        now: Standing,
+        report: training.Report,
+        seconds: float,
+        compiled: bool,
+        steps: int,
+    ) -> None:
+        """Writes a progress report to tables, events and screen."""
+        settings, stage = self.plan.settings, now.stage
+        interactions = now.steps * settings.envs
+        returns: list[float | None] = []
+        rows = []
+        for member, seed in enumerate(self.plan.seeds):
+            ended = int(report.episodes[member])
+            score = float(report.returns[member]) / ended if ended else None
+            returns.append(_finite(score))
+            updates = max(float(report.updates[member]), 1.0)
+            metrics = {
+                name: _finite(float(total[member]) / updates)
+                for name, total in report.metrics.items()
+            }
+            row = {
+                "stage": stage,
+                "seed": seed,
+                "interactions": interactions,
+                "return": returns[-1],
+            }
+            rows.append(row | metrics)
+        runfolder.append(self.folder, "training.jsonl", rows)
+        timing = {
+            "stage": stage,
+            "interactions": interactions,
+            "seconds": seconds,
+            "compile": compiled,
+        }
+        runfolder.append(self.folder, "timing.jsonl", [timing])
+        for row in rows:
+            self.events.training(row, settings.interactions)
+        rate = steps * settings.envs * len(rows) / seconds
+        total = settings.interactions * settings.tasks
+        left = total - stage * settings.interactions - interactions
+        self.progress.update(
+            stage,
+            interactions,
+            returns,
+            rate,
+            None if compiled else left * len(rows) / rate,
+        )
+
+    def conclude(
+        self, now: Standing, task: Task
+    ) -> tuple[Standing, list[float | None]]:
+        """Lets the method end the task, and evaluates all tasks."""
+        program, members, stage = self.plan.program, self.plan.members, now.stage
+        assert now.state is not None
+        learner = now.state.learner
+        before = now.before
+        # Drop the buffer before the environments of the evaluation are made.
+        now = now._replace(state=None)
+        now = self.select(now, learner, task, 1)
+        selection = None
+        if before is not None and now.before is not None:
+            selection = Selection(before, now.before)
+        learner = program.finish(members, learner, stage, selection)
+        now = now._replace(stage=stage + 1, steps=0, learner=learner, before=None)
+        returns = self.evaluate(now, stage)
+        return now, [_finite(float(r)) for r in returns[:, stage]]
+
+    def evaluate(self, now: Standing, stage: int) -> np.ndarray:
+        """Plays all tasks without exploration; returns `[members, tasks]`."""
+        plan, settings = self.plan, self.plan.settings
+        program, members = plan.program, plan.members
+        policies = program.policies(members, now.learner)
+        keys = self.keys(_EVALUATION, stage + 1, settings.tasks)
+        result = program.rollout(plan.tasks, policies, keys, settings.eval_episodes)
+        returns = np.asarray(result.returns, np.float64).mean(axis=2)
+        sizes = np.asarray(program.size(members, now.learner))
+        rows = [
+            {
+                "stage": stage,
+                "task": index,
+                "name": plan.names[index],
+                "seed": seed,
+                "return": _finite(float(returns[member, index])),
+                "episodes": settings.eval_episodes,
+                "interactions": {
+                    "training": (stage + 1) * self.plan.steps * settings.envs,
+                    "selection": int(now.selection[member]),
+                },
+                "diverged": not bool(now.alive[member]),
+                "model_size": int(sizes[member]) / base_size(plan.spec),
+            }
+            for member, seed in enumerate(plan.seeds)
+            for index in range(settings.tasks)
+        ]
+        runfolder.append(self.folder, "results.jsonl", rows)
+        for row in rows:
+            self.events.evaluation(row)
+        return returns
+
+
+def _finite(value: float | None) -> float | None:
+    # JSON has no NaN.
+    return value if value is not None and np.isfinite(value) else None
+
+
+@contextmanager
+def _interruptible(run: Run) -> Iterator[None]:
+    """Ctrl-C once: stop after the running chunk and save. Twice: stop at once."""
+
+    def handle(number: int, frame: Any) -> None:
+        if run.stopping:
+            raise KeyboardInterrupt
+        run.stopping = True
+        run.progress.message("stopping after this chunk; press Ctrl-C again to kill")
+
+    try:
+        previous = signal.signal(signal.SIGINT, handle)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def train(
+    settings: Settings,
+    out: str | Path,
+    *,
+    scenario: Scenario | None = None,
+    resume: bool = False,
+    tensorboard: bool = False,
+    progress: Callable[..., Progress] = Progress,
+) -> Path:
+    """Learns a sequence of tasks; see `runfolder` for what it writes.
+
+    Args:
+      settings: of the run, for instance from `preset`.
+      out: folder of the run, new or empty, or with `resume` an unfinished run's.
+      scenario: one of your own; otherwise made from the settings.
+      resume: continue from the newest checkpoint that is whole.
+      tensorboard: also write TensorBoard events, one log a seed.
+      progress: makes the display.
+
+    Returns:
+      The folder.
+
+    Raises:
+      UserError: wrong settings, a folder that does not fit, a full disk.
+      Stopped: interrupted, and saved.
+    """
+    folder = Path(out)
+    plan = prepare(settings, scenario)
+    saved = config.to_json(plan.settings)
+    if resume:
+        _compare(runfolder.read_header(folder)["settings"], saved, folder)
+    else:
+        header = {
+            "settings": saved,
+            "tasks": plan.names,
+            "spec": plan.spec._asdict(),
+            "provenance": runfolder.provenance(),
+        }
+        runfolder.create(folder, header)
+    label = f"{settings.method} on {settings.scenario}"
+    with ExitStack() as stack:
+        display = stack.enter_context(
+            progress(plan.names, plan.settings.interactions, plan.seeds, label)
+        )
+        events = stack.enter_context(Events(folder, plan.seeds, tensorboard))
+        run = Run(plan, folder, events, display)
+        stack.enter_context(_interruptible(run))
+        now = standing.restore(folder, plan, display.message) if resume else None
+        now = now or run.start()
+        while now.stage < plan.settings.tasks:
+            now = run.task(now)
+    return folder
+
+
+def _compare(saved: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
+    """Raises `UserError` if a run would be continued with other settings."""
+
+    def flat(data: dict[str, Any]) -> dict[str, Any]:
+        rows: dict[str, Any] = {}
+        for name, value in data.items():
+            rows |= flat(value) if isinstance(value, dict) else {name: value}
+        return rows
+
+    then, now = flat(saved), flat(wanted)
+    changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
+    if changed:
+        first = changed[0]
+        raise UserError(
+            f"{folder} was started with other settings: {config.flag(first)} was "
+            f"{then.get(first)}, not {now.get(first)}; drop it or name another --out"
+        )

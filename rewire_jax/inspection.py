@@ -1,0 +1,86 @@
+"""Looking at scenarios and at finished runs."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rewire_jax import checkpoint, config, runfolder, standing
+from rewire_jax.methods import METHODS, find_method
+from rewire_jax.plan import base_size, prepare
+from rewire_jax.presets import preset
+from rewire_jax.scenarios import Scenario
+
+
+def info(scenario: Scenario) -> dict[str, Any]:
+    """What there is to know about a scenario before running it, JSON-ready."""
+    sizes = {}
+    for method in sorted(METHODS):
+        plan = prepare(preset(scenario, method))
+        learner = plan.program.init(plan.members)
+        size = int(plan.program.size(plan.members, learner)[0])
+        sizes[method] = size / base_size(plan.spec)
+    return {
+        "scenario": scenario.name,
+        "domain": scenario.domain,
+        "backend": scenario.backend,
+        "interactions": scenario.interactions,
+        "observation_size": scenario.environment.observation_size,
+        "action_size": scenario.environment.action_size,
+        "tasks": [
+            {
+                "name": task.name,
+                "action_scale": task.action_scale.tolist(),
+                "observation_mask": task.observation_mask.tolist(),
+            }
+            for task in scenario.tasks
+        ],
+        "model_size": sizes,
+    }
+
+
+def evaluate(
+    run: str | Path, *, stage: int | None = None, episodes: int = 128, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Plays all tasks of a run without exploration.
+
+    Args:
+      run: folder of the run.
+      stage: as it was after this task's training; the latest if None.
+      episodes: for each task and member.
+      seed: of the episodes.
+
+    Returns:
+      A row for each member and task: task, name, seed (the member's), return, std
+      (over episodes), steps (in all episodes).
+
+    Raises:
+      UserError: no such run or stage, or a damaged checkpoint.
+    """
+    config.require(episodes >= 1, f"--episodes must be at least 1, not {episodes}")
+    folder = Path(run)
+    header = runfolder.read_header(folder)
+    entry = find_method(header["settings"]["method"])
+    plan = prepare(config.from_json(header["settings"], entry.settings))
+    learner = jax.eval_shape(plan.program.init, plan.members)
+    like = {"policy": (learner.params, learner.memory)}
+    items, _ = checkpoint.load(standing.kept(folder, stage), like)
+    params, memory = items["policy"]
+    learner = plan.program.init(plan.members)._replace(params=params, memory=memory)
+    policies = plan.program.policies(plan.members, learner)
+    keys = jax.random.split(jax.random.key(seed), (len(plan.seeds), len(plan.names)))
+    result = plan.program.rollout(plan.tasks, policies, keys, episodes)
+    returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
+    return [
+        {
+            "task": task,
+            "name": name,
+            "seed": member_seed,
+            "return": float(returns[member, task].mean()),
+            "std": float(returns[member, task].std()),
+            "steps": int(lengths[member, task].sum()),
+        }
+        for member, member_seed in enumerate(plan.seeds)
+        for task, name in enumerate(plan.names)
+    ]

@@ -1,0 +1,121 @@
+"""The files of a run: a header, and tables to which rows are appended.
+
+settings.json     settings, task names, network sizes, provenance
+results.jsonl     a row for each evaluation: stage, task, seed
+training.jsonl    a row for each progress report and seed
+timing.jsonl      a row for each progress report: wall-clock seconds
+checkpoints/      `task-03` after each task, `during` in the middle of one
+"""
+
+import importlib.metadata
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from rewire_jax.errors import UserError
+
+FORMAT = 1
+HEADER = "settings.json"
+TABLES = ("results.jsonl", "training.jsonl", "timing.jsonl")
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "mujoco", "orbax-checkpoint")
+
+
+def provenance() -> dict[str, Any]:
+    """What a result must be traced back by: command, commit, versions, device."""
+    here = Path(__file__).parent
+    try:
+        commit = subprocess.run(
+            ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"],
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "unknown"
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    versions["rewire_jax"] = importlib.metadata.version("rewire_jax")
+    devices = jax.devices()
+    return {
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "commit": commit,
+        "versions": versions,
+        "device": f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})",
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def create(folder: Path, header: Mapping[str, Any]) -> None:
+    """Makes a run folder.
+
+    Raises:
+      UserError: the folder holds something, or cannot be written.
+    """
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            what = "another run" if (folder / HEADER).exists() else "something else"
+            raise UserError(
+                f"{folder} holds {what}: name another folder with --out, or continue "
+                "the run there with --resume"
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps({"format": FORMAT, **header}, indent=1)
+        temporary = folder / f".{HEADER}"
+        temporary.write_text(text + "\n")
+        temporary.rename(folder / HEADER)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error}") from error
+
+
+def read_header(folder: Path) -> dict[str, Any]:
+    """The header of a run.
+
+    Raises:
+      UserError: there is no run, or one of another format.
+    """
+    try:
+        header = json.loads((folder / HEADER).read_text())
+    except OSError as error:
+        raise UserError(f"{folder} holds no run: {HEADER} cannot be read") from error
+    except ValueError as error:
+        raise UserError(f"{folder / HEADER} is damaged: {error}") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise UserError(f"{folder} was not written by this version of rewire_jax")
+    return header
+
+
+def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Adds rows to a table; `UserError` if they cannot be written."""
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    try:
+        with (folder / table).open("a") as file:
+            file.write(text)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder / table}: {error}") from error
+
+
+def lengths(folder: Path) -> dict[str, int]:
+    """Bytes in each table, to come back to with `cut`."""
+    paths = {table: folder / table for table in TABLES}
+    return {t: path.stat().st_size if path.exists() else 0 for t, path in paths.items()}
+
+
+def cut(folder: Path, lengths: Mapping[str, int]) -> None:
+    """Forgets what was written after `lengths` was taken.
+
+    Raises:
+      UserError: a table has lost rows since then.
+    """
+    for table, length in lengths.items():
+        path = folder / table
+        have = path.stat().st_size if path.exists() else 0
+        if have < length:
+            raise UserError(f"{path} has lost rows: restore it or start a new run")
+        if have > length:
+            with path.open("r+b") as file:
+                file.truncate(length)

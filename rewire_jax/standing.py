@@ -1,0 +1,166 @@
+"""Where a run stands, and its checkpoints.
+
+`checkpoints/task-003` is what is kept for ever once three tasks are finished: policies
+and critics, since all else starts anew with a task. `checkpoints/task-003-step-0000200`
+is everything in the middle of the next one; only the last of these is kept.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax import checkpoint, runfolder
+from rewire_jax.errors import UserError
+from rewire_jax.plan import Plan
+from rewire_jax.sac import Learner
+from rewire_jax.training import State
+
+_FOLDER = "checkpoints"
+
+
+class Standing(NamedTuple):
+    """Where a run stands; between tasks `state` is None and `steps` 0.
+
+    Attributes:
+      stage: the task being trained, or to be trained next.
+      steps: steps of all environments made in it.
+      learner: between tasks, what was learned.
+      state: within a task, all of it.
+      before: within a task, the candidates' returns at its start, or None.
+      alive: `[members]` bool on the host, False for frozen members.
+      selection: `[members]` int, interactions spent on candidates so far.
+    """
+
+    stage: int
+    steps: int
+    learner: Learner | None
+    state: State | None
+    before: jax.Array | None
+    alive: np.ndarray
+    selection: jax.Array
+
+
+def start(plan: Plan) -> Standing:
+    """Before the first task."""
+    members = len(plan.seeds)
+    return Standing(
+        stage=0,
+        steps=0,
+        learner=plan.program.init(plan.members),
+        state=None,
+        before=None,
+        alive=np.ones(members, bool),
+        selection=jnp.zeros(members, jnp.int32),
+    )
+
+
+def save(folder: Path, standing: Standing) -> None:
+    """Writes a checkpoint, and drops those from within a task that it outdates."""
+    items: dict[str, Any] = {
+        "counts": {"alive": standing.alive, "selection": standing.selection}
+    }
+    name = _name(standing.stage)
+    if standing.learner is not None:
+        items |= _kept(standing.learner)
+    else:
+        name += f"-step-{standing.steps:07d}"
+        items |= {"state": standing.state}
+        if standing.before is not None:
+            items["before"] = standing.before
+    metadata = {
+        "stage": standing.stage,
+        "steps": standing.steps,
+        "items": sorted(items),
+        "tables": runfolder.lengths(folder),
+    }
+    checkpoint.save(folder / _FOLDER / name, items, metadata)
+    checkpoints = checkpoint.available(folder / _FOLDER)
+    checkpoint.remove(p for p in checkpoints if "-step-" in p.name and p.name != name)
+
+
+def kept(folder: Path, stage: int | None) -> Path:
+    """The checkpoint kept after a stage, or after the latest one.
+
+    Raises:
+      UserError: there is none.
+    """
+    checkpoints = checkpoint.available(folder / _FOLDER)
+    between = [path for path in checkpoints if "-step-" not in path.name]
+    if stage is not None:
+        between = [path for path in between if path.name == _name(stage + 1)]
+    if not between:
+        which = (
+            "finished no task" if stage is None else f"no checkpoint of task {stage}"
+        )
+        raise UserError(f"{folder} has {which} yet")
+    return between[0]
+
+
+def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | None:
+    """The newest standing whose checkpoint is whole, None if there is none.
+
+    What the run's tables hold beyond it is cut off.
+
+    Args:
+      folder: of the run.
+      plan: of the run.
+      say: is told about every checkpoint that cannot be used.
+    """
+    for path in checkpoint.available(folder / _FOLDER):
+        try:
+            standing, tables = _load(path, plan)
+        except checkpoint.CheckpointError as error:
+            say(f"{error}; falling back to the one before")
+            continue
+        runfolder.cut(folder, tables)
+        return standing
+    runfolder.cut(folder, dict.fromkeys(runfolder.TABLES, 0))
+    return None
+
+
+def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, int]]:
+    program, members = plan.program, plan.members
+    number = len(plan.seeds)
+    learner = jax.eval_shape(program.init, members)
+    alive = jax.ShapeDtypeStruct((number,), bool)
+    selection = jax.ShapeDtypeStruct((number,), jnp.int32)
+    like: dict[str, Any] = {"counts": {"alive": alive, "selection": selection}}
+    saved = checkpoint.read_metadata(path)["items"]
+    if "state" in saved:
+        task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+        like["state"] = jax.eval_shape(program.begin, members, learner, alive, 0, task)
+    else:
+        like |= _kept(learner)
+    if "before" in saved and program.candidates is not None:
+        candidates = jax.eval_shape(program.candidates, members, learner, 0)
+        like["before"] = jax.ShapeDtypeStruct(candidates.valid.shape, jnp.float32)
+    items, metadata = checkpoint.load(path, like)
+    items = jax.tree.map(jnp.asarray, items)
+    restored = None
+    if "policy" in items:
+        params, memory = items["policy"]
+        # The rest of a learner starts anew with the next task.
+        restored = program.init(members)._replace(
+            params=params, memory=memory, critic=items["critic"]
+        )
+    return Standing(
+        stage=metadata["stage"],
+        steps=metadata["steps"],
+        learner=restored,
+        state=items.get("state"),
+        before=items.get("before"),
+        alive=np.asarray(items["counts"]["alive"]),
+        selection=items["counts"]["selection"],
+    ), metadata["tables"]
+
+
+def _kept(learner: Learner) -> dict[str, Any]:
+    return {"policy": (learner.params, learner.memory), "critic": learner.critic}
+
+
+def _name(tasks: int) -> str:
+    return f"task-{tasks:03d}"
