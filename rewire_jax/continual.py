@@ -142,14 +142,16 @@ class Run:
         steps: int,
     ) -> None:
         """Writes a progress report to tables, events and screen."""
-        settings, stage = self.plan.settings, now.stage
+        plan, settings, stage = self.plan, self.plan.settings, now.stage
         interactions = now.steps * settings.envs
         returns: list[float | None] = []
         rows = []
-        for member, seed in enumerate(self.plan.seeds):
+        for member, seed in enumerate(plan.seeds):
             ended = int(report.episodes[member])
             score = float(report.returns[member]) / ended if ended else None
-            returns.append(_finite(score))
+            reward = float(report.rewards[member]) / steps
+            # Few steps end an episode: show what this reward makes in a whole one.
+            returns.append(_finite(reward * plan.scenario.environment.episode_length))
             updates = max(float(report.updates[member]), 1.0)
             metrics = {
                 name: _finite(float(total[member]) / updates)
@@ -159,7 +161,8 @@ class Run:
                 "stage": stage,
                 "seed": seed,
                 "interactions": interactions,
-                "return": returns[-1],
+                "return": _finite(score),
+                "reward": _finite(reward),
             }
             rows.append(row | metrics)
         runfolder.append(self.folder, "training.jsonl", rows)
@@ -297,6 +300,7 @@ def train(
             "settings": saved,
             "tasks": plan.names,
             "spec": plan.spec._asdict(),
+            "episode_length": plan.scenario.environment.episode_length,
             "provenance": runfolder.provenance(),
         }
         runfolder.create(folder, header)

@@ -113,7 +113,8 @@ def curves(
     _entitle(
         figure,
         title,
-        "lines: training episodes, mean over seeds, band from lowest to highest",
+        "lines: training reward a step × steps of an episode, mean over seeds, "
+        "band from lowest to highest",
     )
     figure.savefig(path)
 

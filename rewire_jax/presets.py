@@ -84,5 +84,13 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         selection_episodes=12,
         report_every=2_560,
         checkpoint_every=12_800,
-        sac=dataclasses.replace(paper.sac, hidden=128, lr_critic=1e-3),
+        # A temperature that falls from 2 at the paper's rate would keep the policy
+        # random for longer than the whole profile.
+        sac=dataclasses.replace(
+            paper.sac,
+            hidden=128,
+            lr_critic=1e-3,
+            initial_temperature=0.2,
+            lr_temperature=1e-3,
+        ),
     )

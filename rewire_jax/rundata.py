@@ -33,8 +33,9 @@ class RunData:
         model_size: numbers stored ÷ those of one policy, the maximum over the run.
         training: interactions spent on training, a seed.
         selection: interactions spent on choosing and rolling back, a seed.
-        curve: per stage, interactions within the task `[points]` and training returns
-            `[S, points]`, NaN where no episode ended.
+        episode_length: steps to the time limit.
+        curve: per stage, interactions within the task `[points]` and what the training
+            reward a step makes in a whole episode, `[S, points]`; NaN where missing.
         rate: training interactions of all seeds per second, without the chunks that
             compiled; None where there is no other chunk.
     """
@@ -51,6 +52,7 @@ class RunData:
     model_size: float
     training: int
     selection: int
+    episode_length: int
     curve: tuple[tuple[Array, Array], ...]
     rate: float | None
 
@@ -79,7 +81,7 @@ def read_run(folder: str | Path) -> RunData:
         UserError: a file is missing, or damaged elsewhere than in its last line.
     """
     folder = Path(folder)
-    settings, tasks, provenance = _head(folder / "settings.json")
+    settings, tasks, provenance, episode_length = _head(folder / "settings.json")
     results = _table(folder / "results.jsonl", lambda row: _result(row, len(tasks)))
     if not results:
         raise UserError(f"{folder / 'results.jsonl'} holds no results yet")
@@ -109,23 +111,27 @@ def read_run(folder: str | Path) -> RunData:
         # Equal for all seeds but those that stopped early because they diverged.
         training=max(training for training, _ in spent),
         selection=max(selection for _, selection in spent),
-        curve=_curve(folder / "training.jsonl", len(tasks), place, began),
+        episode_length=episode_length,
+        curve=_curve(
+            folder / "training.jsonl", len(tasks), place, began, episode_length
+        ),
         rate=_rate(folder / "timing.jsonl", len(tasks), len(seeds), began),
     )
 
 
-def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any]]:
-    """Settings, tasks and provenance from `settings.json`."""
+def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any], int]:
+    """Settings, tasks, provenance and episode length from `settings.json`."""
     try:
         head = json.loads(_text(path))
         settings, provenance = dict(head["settings"]), dict(head["provenance"])
         tasks = tuple(str(name) for name in head["tasks"])
+        episode_length = int(head["episode_length"])
         missing = [name for name in _NEEDED if name not in settings]
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path} is damaged ({_reason(error)})") from None
     if missing or not tasks:
         raise UserError(f"{path} lacks {', '.join(missing) or 'tasks'}")
-    return settings, tasks, provenance
+    return settings, tasks, provenance, episode_length
 
 
 def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str, Any]]:
@@ -141,13 +147,13 @@ def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str,
 
 
 def _curve(
-    path: Path, tasks: int, place: dict[int, int], began: bool
+    path: Path, tasks: int, place: dict[int, int], began: bool, episode_length: int
 ) -> tuple[tuple[Array, Array], ...]:
-    """Training returns per stage, see `RunData.curve`."""
+    """Training rewards per stage, see `RunData.curve`."""
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
         at = _index(row, "stage", 0, tasks), int(row["interactions"])
-        return (*at, place[row["seed"]]), _number(row["return"])
+        return (*at, place[row["seed"]]), _number(row["reward"]) * episode_length
 
     rows = _table(path, parse, needed=began)
     curve = []

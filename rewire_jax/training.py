@@ -63,12 +63,14 @@ class Report(NamedTuple):
     Attributes:
       episodes: `[]`, training episodes that ended.
       returns: `[]`, the sum of their returns.
+      rewards: `[]`, the sum over steps of the mean reward of all environments.
       updates: `[]`, steps with updates.
       metrics: sums over these steps, of each one's last update.
     """
 
     episodes: jax.Array
     returns: jax.Array
+    rewards: jax.Array
     updates: jax.Array
     metrics: sac.Metrics
 
@@ -204,6 +206,7 @@ def train(
         report = Report(
             report.episodes + jnp.sum(ended),
             report.returns + jnp.sum(jnp.where(ended, stepped.score, 0.0)),
+            report.rewards + jnp.mean(stepped.reward),
             report.updates + (updates > 0),
             jax.tree.map(jnp.add, report.metrics, metrics),
         )
@@ -212,17 +215,28 @@ def train(
     batch = draw(key, state.collection.buffer, jnp.asarray(1))
     zeros = sac.policy_metrics(state.learner, batch, method, settings)
     zeros |= {"critic_loss": jnp.zeros(()), "q": jnp.zeros(())}
-    report = Report(jnp.zeros((), jnp.int32), jnp.zeros(()), jnp.zeros(()), zeros)
+    none = jnp.zeros(())
+    report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros)
     return jax.lax.fori_loop(time, time + steps, step, (state, report))
 
 
 @functools.lru_cache
-def _rollout(environment: Environment, act: Callable[..., Any]) -> Callable[..., Any]:
-    # Methods whose policies are computed alike share one compiled function.
-    episodes = functools.partial(rollout.episodes, environment, act)
-    return jax.jit(episodes, static_argnums=3)
+def rollout_function(
+    environment: Environment, act: Callable[..., Any], rows: int, count: int
+) -> Callable[..., rollout.Rollout]:
+    """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
+
+    Methods whose policies are computed alike share one compiled function.
+    """
+
+    def episodes(tasks: Task, policies: Any, keys: jax.Array) -> rollout.Rollout:
+        assert keys.shape[1] == rows
+        return rollout.episodes(environment, act, tasks, policies, keys, count)
+
+    return jax.jit(episodes)
 
 
+@functools.lru_cache
 def build(
     environment: Environment,
     make: Callable[[Spec, Any], Method],
@@ -230,7 +244,7 @@ def build(
     shape: Shape,
     example: Any,
 ) -> Program:
-    """The functions of a run.
+    """The functions of a run; runs alike in all but numbers share them.
 
     Args:
       environment: of the scenario.
@@ -241,14 +255,18 @@ def build(
     """
 
     def init(member):
-        return sac.init(member.keys, make(spec, member.options), spec, member.sac)
+        key = jax.random.fold_in(member.keys, 0)
+        return sac.init(key, make(spec, member.options), spec, member.sac)
 
-    def task_key(member, index):
-        return jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
+    def task_keys(member, index):
+        # One for the start, one for the steps. A key is either split or folded,
+        # never both: `split(key)[i]` is the same key as `fold_in(key, i)`.
+        key = jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
+        return jax.random.split(key)
 
     def begin(member, learner, alive, index, task):
         method = make(spec, member.options)
-        start_key, reset_key = jax.random.split(task_key(member, index))
+        start_key, reset_key = jax.random.split(task_keys(member, index)[0])
         params, memory = method.start_task(
             start_key, learner.params, learner.memory, index
         )
@@ -266,7 +284,7 @@ def build(
 
     def chunk(member, state, index, task, time, steps):
         return train(
-            task_key(member, index),
+            task_keys(member, index)[1],
             state,
             task,
             time,
@@ -294,6 +312,10 @@ def build(
         policy = functools.partial(method.policy, learner.params, learner.memory)
         return jax.vmap(policy)(jnp.arange(spec.tasks))
 
+    def rollout_episodes(tasks, policies, keys, count):
+        function = rollout_function(environment, method.act, keys.shape[1], count)
+        return function(tasks, policies, keys)
+
     def size(member, learner):
         return make(spec, member.options).size(learner.params, learner.memory)
 
@@ -306,6 +328,6 @@ def build(
         candidates=method.candidates and jax.jit(jax.vmap(candidates, (0, 0, None))),
         finish=jax.jit(jax.vmap(finish, (0, 0, None, 0))),
         policies=jax.jit(jax.vmap(policies)),
-        rollout=_rollout(environment, method.act),
+        rollout=rollout_episodes,
         size=jax.jit(jax.vmap(size)),
     )

@@ -255,7 +255,16 @@ V1_JOINTS = [f"{joint}_{leg}" for leg in (1, 2, 3, 4) for joint in ("hip", "ankl
     ],
 )
 def test_ant_masks_mean_what_they_meant_in_v1(name, v1_indices):
-    order = "hip_4 ankle_4 hip_1 ankle_1 hip_2 ankle_2 hip_3 ankle_3".split()
+    order = [
+        "hip_4",
+        "ankle_4",
+        "hip_1",
+        "ankle_1",
+        "hip_2",
+        "ankle_2",
+        "hip_3",
+        "ankle_3",
+    ]
     off = {V1_JOINTS[i] for i in v1_indices}
     scale = domains.make_domain("ant").make_task(CHANGES["ant"][name]).action_scale
     assert scale.tolist() == [0.0 if joint in off else 1.0 for joint in order]

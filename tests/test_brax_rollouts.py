@@ -171,7 +171,8 @@ def test_masked_actions_cost_nothing_and_hidden_entries_are_zero():
     np.testing.assert_allclose(reward, free, rtol=1e-5)
     np.testing.assert_allclose(observed, full * off.observation_mask, rtol=1e-5)
     assert np.any(full != observed)
-    assert terminal.dtype == bool and not terminal.any()
+    assert terminal.dtype == bool
+    assert not terminal.any()
 
 
 def test_a_fallen_ant_is_terminal():

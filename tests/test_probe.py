@@ -1,3 +1,5 @@
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,7 +47,8 @@ def test_states_keep_their_type_and_are_pure(name):
     action = jnp.ones(environment.action_size)
     second = environment.step(task, first, action)
     assert first.observation.shape == (environment.observation_size,)
-    assert first.reward == 0 and not first.terminal
+    assert first.reward == 0
+    assert not first.terminal
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
     again = jax.jit(environment.step)(task, first, action)
@@ -61,7 +64,8 @@ def test_observation_is_its_worth():
     values = set()
     for seed in range(8):
         seen, rewards, ends = play("observation", nothing, key=jax.random.key(seed))
-        assert rewards == seen[0].tolist() and ends == [True]
+        assert rewards == seen[0].tolist()
+        assert ends == [True]
         values.add(rewards[0])
     assert values == {-1.0, 1.0}
 
@@ -76,7 +80,8 @@ def test_action_is_best_at_a_half():
     grid = np.linspace(-1, 1, 41)
     rewards = [play("action", lambda _, a=a: jnp.array([a]))[1][0] for a in grid]
     assert grid[np.argmax(rewards)] == 0.5
-    assert max(rewards) == 0 and min(rewards) == -2.25
+    assert max(rewards) == 0
+    assert min(rewards) == -2.25
 
 
 def test_match_is_best_at_the_observation():
@@ -84,10 +89,12 @@ def test_match_is_best_at_the_observation():
     for seed in range(4):
         key = jax.random.key(seed)
         observations, rewards, ends = play("match", lambda o: o, key=key)
-        assert rewards == [0.0] and ends == [True]
+        assert rewards == [0.0]
+        assert ends == [True]
         assert play("match", lambda o: o + 0.1, key=key)[1][0] < 0
         seen.append(observations[0].item())
-    assert len(set(seen)) == 4 and max(np.abs(seen)) <= 0.5
+    assert len(set(seen)) == 4
+    assert max(np.abs(seen)) <= 0.5
 
 
 def test_endless_is_only_cut_off():
@@ -112,10 +119,11 @@ def test_reach_by_the_documented_best_action():
         return jnp.clip((goal - position) / probe.REACH_STRIDE, -1, 1)
 
     seen, rewards, ends = play("reach", best)
-    assert len(rewards) == 20 and not any(ends)
+    assert len(rewards) == 20
+    assert not any(ends)
     np.testing.assert_allclose(seen[-1], goal, atol=1e-5)
     np.testing.assert_allclose(rewards[-1], 0, atol=1e-8)
-    assert all(a <= b for a, b in zip(rewards, rewards[1:], strict=False))
+    assert all(a <= b for a, b in itertools.pairwise(rewards))
     rng = np.random.default_rng(0)
     for _ in range(10):
         other = play("reach", lambda p: best(p) * rng.uniform(-1, 1, 2))[1]

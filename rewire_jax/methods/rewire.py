@@ -33,6 +33,9 @@ class RewireSettings:
         gradient in the adapters differs.
       tau: temperature of the wirings' relaxation (Eq. 4).
       adapter_tau: the same for the adapters.
+      adapter_rate: factor on the adapters' learning rate. At 1, as in the authors'
+        code, Adam moves the adapters' scores past each other within some ten steps
+        even where their gradient is next to nothing.
       noise: scale of Gumbel noise on the scores in updates.
       dropout: share of each hidden layer's output dropped in training.
       mode_rate: the learning rate of scores is multiplied by K: "step" scales the
@@ -50,6 +53,7 @@ class RewireSettings:
     alignment: Literal["norm", "expanded"] = "norm"
     tau: float = 1.0
     adapter_tau: float = 0.1
+    adapter_rate: float = 1.0
     noise: float = 0.1
     dropout: float = static(0.0)
     mode_rate: Literal["step", "gradient"] = "step"
@@ -63,9 +67,10 @@ class RewireSettings:
             f"--mode-slots {self.mode_slots} has no place for --modes {self.modes}",
         )
         require(self.head_slots >= 1, "--head-slots must be at least 1")
-        for name in ("alpha", "beta", "noise"):
+        for name in ("alpha", "beta", "noise", "adapter_rate"):
             value = getattr(self, name)
-            require(0 <= value < jnp.inf, f"--{name} must be at least 0, not {value}")
+            flag = name.replace("_", "-")
+            require(0 <= value < jnp.inf, f"--{flag} must be at least 0, not {value}")
         require(0 <= self.dropout < 1, "--dropout must lie in [0, 1)")
         for name in ("tau", "adapter_tau"):
             value = getattr(self, name)
@@ -141,7 +146,7 @@ class Context(NamedTuple):
     Attributes:
       mode: `[]` int, the wiring to use.
       noise: `[L, n]`, added to its scores.
-      key: for dropout, and for the mode to distil from.
+      key: for dropout.
     """
 
     mode: jax.Array
@@ -170,11 +175,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         return params, Memory(jnp.zeros((), jnp.int32), hidden, head, orders)
 
     def known_slot(memory, task):
-        # A task that has not been seen has the latest slot, or its earlier round's.
-        latest = jnp.maximum(memory.learned - 1, 0)
-        return jnp.where(
-            memory.learned >= slots, task % slots, jnp.minimum(task, latest)
-        )
+        # A task that has not been seen has its earlier round's slot, or the latest.
+        return jnp.minimum(task % slots, jnp.maximum(memory.learned - 1, 0))
 
     def start_task(key, params, memory, task):
         del key
@@ -209,7 +211,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
     def scores_of(params, mode):
         scores = params.scores[mode]
         if options.mode_rate == "gradient":
-            scores = scores * modes - jax.lax.stop_gradient(scores * (modes - 1))
+            # Adds exactly 0, so that close scores keep their order.
+            scores += (modes - 1) * (scores - jax.lax.stop_gradient(scores))
         return scores
 
     def distribution(params, memory, context, observation):
@@ -246,9 +249,13 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
 
     def adjust_updates(updates, memory):
         del memory
-        if options.mode_rate == "gradient":
-            return updates
-        return updates._replace(scores=updates.scores * modes)
+        rate = 1.0 if options.mode_rate == "gradient" else modes
+        return updates._replace(
+            scores=updates.scores * rate,
+            adapters=jax.tree.map(
+                lambda update: update * options.adapter_rate, updates.adapters
+            ),
+        )
 
     def candidates(params, memory, task):
         del task
@@ -265,7 +272,9 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         failed = jnp.asarray(False)
         if selection is not None:
             valid = jnp.arange(places) < modes
-            after = jnp.where(valid, selection.after, -jnp.inf)
+            # A return that is not a number must not win, as it would in argmax.
+            valued = valid & ~jnp.isnan(selection.after)
+            after = jnp.where(valued, selection.after, -jnp.inf)
             before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / modes
             order = jnp.argsort(params.scores[jnp.argmax(after)], axis=-1)
             failed = (memory.learned > 0) & (jnp.max(after) < before)

@@ -1,0 +1,269 @@
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rewire_jax
+from rewire_jax import checkpoint, continual, plan, standing, training
+from rewire_jax.config import Settings
+from rewire_jax.envs.base import TaskChange
+from rewire_jax.errors import UserError
+from rewire_jax.report import write_report
+from rewire_jax.scenarios import Scenario, ScenarioSpec, make_scenario
+
+TABLES = ("results.jsonl", "training.jsonl")
+
+
+def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Settings:
+    if isinstance(scenario, str):
+        scenario = make_scenario(scenario)
+    quick = rewire_jax.preset(scenario, method, "quick")
+    return dataclasses.replace(
+        quick,
+        seeds=2,
+        interactions=640,
+        envs=16,
+        updates=4,
+        warmup=160,
+        eval_episodes=4,
+        selection_episodes=12,
+        report_every=160,
+        checkpoint_every=320,
+        sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
+    )
+
+
+def arguments(settings: Settings, out: Path) -> list[str]:
+    flags = {
+        name: getattr(settings, name)
+        for name in [
+            "method",
+            "profile",
+            "seeds",
+            "interactions",
+            "envs",
+            "updates",
+            "warmup",
+            "eval_episodes",
+            "selection_episodes",
+            "report_every",
+            "checkpoint_every",
+        ]
+    } | {"hidden": settings.sac.hidden, "batch_size": settings.sac.batch_size}
+    words = [w for n, v in flags.items() for w in ("--" + n.replace("_", "-"), str(v))]
+    return ["train", settings.scenario, "--out", str(out), *words]
+
+
+def command(words: list[str]) -> list[str]:
+    return [sys.executable, "-m", "rewire_jax.cli", *words]
+
+
+def rows(folder: Path, table: str = "results.jsonl") -> list[dict]:
+    return [json.loads(line) for line in (folder / table).read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return continual.train(tiny(), folder, tensorboard=True)
+
+
+def checkpoints(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "checkpoints").iterdir())
+
+
+def leaves(folder: Path, settings: Settings) -> list[np.ndarray]:
+    prepared = plan.prepare(settings)
+    learner = jax.eval_shape(prepared.program.init, prepared.members)
+    like = {"policy": (learner.params, learner.memory), "critic": learner.critic}
+    items, _ = checkpoint.load(standing.kept(folder, None), like)
+    return jax.tree.leaves(items)
+
+
+def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
+    places = [(row["stage"], row["task"], row["seed"]) for row in rows(run)]
+    expected = [(s, t, m) for s in range(-1, 4) for m in range(2) for t in range(4)]
+    assert sorted(places) == sorted(expected)
+    assert checkpoints(run) == [f"task-{task:03d}" for task in (1, 2, 3, 4)]
+    last = rows(run)[-1]
+    assert last["interactions"]["training"] == 4 * 640
+    # Twelve episodes in three modes at start and end of each of four tasks.
+    steps = make_scenario("probe/reach").environment.episode_length
+    assert last["interactions"]["selection"] == 2 * 4 * 12 * steps
+    assert len({row["return"] for row in rows(run)}) > 10
+    assert list((run / "tensorboard").glob("seed-*/events*"))
+    report = write_report([run], run / "report")
+    assert all(path.exists() for path in report.paths)
+
+
+def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    words = arguments(tiny(), folder)
+    process = subprocess.Popen(command(words), stderr=subprocess.PIPE)
+    table = folder / "training.jsonl"
+    while process.poll() is None:
+        # In the middle of the second task, past its full checkpoint.
+        if table.exists() and len(table.read_text().splitlines()) >= 2 * (4 + 2):
+            process.send_signal(signal.SIGKILL)
+            break
+        time.sleep(0.002)
+    assert process.wait() == -signal.SIGKILL
+    assert checkpoints(folder)[-1] != "task-004"
+    subprocess.run(command([*words, "--resume"]), check=True, capture_output=True)
+    for name in TABLES:
+        assert (folder / name).read_bytes() == (run / name).read_bytes()
+    for ours, theirs in zip(leaves(folder, tiny()), leaves(run, tiny()), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+class _Stop(Exception):
+    pass
+
+
+def stop_after(monkeypatch: pytest.MonkeyPatch, chunks: int) -> None:
+    chunk = continual.Run.chunk
+    calls = []
+
+    def counting(self, *rest):
+        if len(calls) == chunks:
+            raise _Stop
+        calls.append(None)
+        return chunk(self, *rest)
+
+    monkeypatch.setattr(continual.Run, "chunk", counting)
+
+
+@pytest.mark.parametrize(("chunks", "damaged"), [(7, 1), (7, 2), (4, 1), (1, 0)])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(
+    run: Path,
+    tmp_path: Path,
+    chunks: int,
+    damaged: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with monkeypatch.context() as patch:
+        stop_after(patch, chunks)
+        with pytest.raises(_Stop):
+            continual.train(tiny(), tmp_path / "run")
+    found = checkpoint.available(tmp_path / "run" / "checkpoints")
+    for path in found[:damaged]:
+        largest = max(path.rglob("*"), key=lambda f: f.stat().st_size * f.is_file())
+        os.truncate(largest, largest.stat().st_size // 2)
+    continual.train(tiny(), tmp_path / "run", resume=True)
+    assert capsys.readouterr().err.count("falling back") == min(damaged, len(found))
+    for name in TABLES:
+        assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes()
+
+
+def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
+    changes = [
+        TaskChange(name, extra={"goal": goal})
+        for name, goal in {"a": (1, 1), "b": (-1, 1), "c": (0, -1), "d": (1, 0)}.items()
+    ]
+    spec = ScenarioSpec("probe/eight", "reach", tuple(changes), 2, 640)
+    scenario = make_scenario(spec)
+    # A width of its own, so that no other test's traces are counted.
+    settings = tiny(scenario)
+    settings = dataclasses.replace(
+        settings, tasks=8, sac=dataclasses.replace(settings.sac, hidden=12)
+    )
+    continual.train(settings, tmp_path / "run", scenario=scenario)
+    prepared = plan.prepare(settings, scenario)
+    program = prepared.program._asdict()
+    act = program.pop("rollout")
+    assert {name: f._cache_size() for name, f in program.items()} == dict.fromkeys(
+        program, 1
+    )
+    del act
+    method = rewire_jax.methods.find_method("rewire")
+    made = method.make(prepared.spec, prepared.settings.options)
+    for row, count in ((8, 4), (3, 4)):
+        function = training.rollout_function(scenario.environment, made.act, row, count)
+        assert function._cache_size() >= 1
+    assert len(rows(tmp_path / "run")) == 9 * 8 * 2
+
+
+def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "elsewhere"
+    subprocess.run(["cp", "-r", str(run), str(copy)], check=True)
+    prepared = plan.prepare(tiny())
+    for task, seed in ((0, 0), (2, 1)):
+        policy = rewire_jax.load_policy(copy, task=task, seed=seed)
+        one = jnp.asarray([0.3, -0.2])
+        many = jnp.stack([one, -one, 2 * one])
+        single = jax.jit(policy)(one)
+        assert single.shape == (2,)
+        np.testing.assert_allclose(jax.vmap(policy)(many)[0], single, atol=1e-6)
+        np.testing.assert_allclose(policy(many)[0], single, atol=1e-6)
+        # It plays as the run's own evaluation says.
+        environment = prepared.scenario.environment
+        data = prepared.scenario.tasks[task].data
+        saved = [
+            row["return"]
+            for row in rows(run)
+            if (row["stage"], row["task"], row["seed"]) == (3, task, seed)
+        ]
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), 4)
+        keys = jax.random.split(jax.random.split(key, 4)[task], 4)
+
+        def play(key, policy=policy, data=data):
+            state = environment.reset(data, key)
+
+            def step(carry, _):
+                state, total = carry
+                state = environment.step(data, state, policy(state.observation))
+                return (state, total + state.reward), None
+
+            carry = (state, jnp.zeros(()))
+            return jax.lax.scan(step, carry, length=environment.episode_length)[0][1]
+
+        assert np.mean(jax.vmap(play)(keys)) == pytest.approx(saved[0], rel=1e-4)
+    earlier = rewire_jax.load_policy(copy, task=0, stage=0)
+    assert not np.allclose(earlier(one), rewire_jax.load_policy(copy, task=0)(one))
+    for wrong in ({"task": 9}, {"task": 0, "seed": 7}, {"task": 0, "stage": 8}):
+        with pytest.raises(UserError):
+            rewire_jax.load_policy(copy, **wrong)
+
+
+def test_evaluate_replays_a_run(run: Path) -> None:
+    played = rewire_jax.evaluate(run, episodes=64)
+    final = {(r["task"], r["seed"]): r["return"] for r in rows(run) if r["stage"] == 3}
+    assert len(played) == len(final)
+    for row in played:
+        # Other episodes, same policy: within the spread of the run's four episodes.
+        spread = 4 * row["std"] / 2
+        assert abs(row["return"] - final[row["task"], row["seed"]]) < spread
+
+
+def test_a_frozen_seed_is_marked_and_the_other_goes_on(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = continual.Run.begin
+
+    def poisoned(self, now, task):
+        now = begin(self, now, task)
+        if now.stage == 1:
+            learner = now.state.learner
+            critic = jax.tree.map(lambda x: x.at[0].set(jnp.nan), learner.critic)
+            state = now.state._replace(learner=learner._replace(critic=critic))
+            now = now._replace(state=state)
+        return now
+
+    monkeypatch.setattr(continual.Run, "begin", poisoned)
+    continual.train(tiny(), tmp_path / "run")
+    marked = {(r["stage"], r["seed"]) for r in rows(tmp_path / "run") if r["diverged"]}
+    assert marked == {(1, 0), (2, 0), (3, 0)}
+    # The other seed is what it was, but for the order of float sums.
+    for ours, theirs in zip(rows(tmp_path / "run"), rows(run), strict=True):
+        if ours["seed"] == 1:
+            assert ours["return"] == pytest.approx(theirs["return"], rel=1e-3)
