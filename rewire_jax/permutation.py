@@ -27,11 +27,12 @@ def permute(x: jax.Array, scores: jax.Array, tau: jax.typing.ArrayLike) -> jax.A
 def _forward(x, scores, tau):
     order = jnp.argsort(scores)
     permuted = jnp.take(x, order, axis=-1)
-    return permuted, (permuted, order, scores, jnp.asarray(tau))
+    return permuted, (permuted, order, scores, tau)
 
 
 def _backward(residuals, gradient):
     permuted, order, scores, tau = residuals
+    tau = jnp.asarray(tau)  # A constant comes back from jit as a plain number.
     n = order.shape[0]
     wide = jnp.promote_types(permuted.dtype, jnp.float32)
     # In the sorted basis both axes of the relaxation follow the sorted scores, so

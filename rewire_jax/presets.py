@@ -59,6 +59,12 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         profile in profiles,
         f"unknown profile {profile!r}: choose one of {', '.join(profiles)}",
     )
+    order = [task.distinct for task in scenario.tasks]
+    period = next(
+        p
+        for p in range(1, len(order) + 1)
+        if all(task == order[i % p] for i, task in enumerate(order))
+    )
     paper = Settings(
         scenario=scenario.name,
         method=method,
@@ -68,14 +74,14 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         interactions=scenario.interactions,
         paper_interactions=scenario.interactions,
         sac=_sac(scenario.name),
-        options=find_method(method).preset(scenario.name, scenario.distinct),
+        options=find_method(method).preset(scenario.name, period),
     )
     if profile == "paper":
         return paper
     interactions = min(30_000, scenario.interactions)
     return dataclasses.replace(
         paper,
-        tasks=min(paper.tasks, scenario.distinct),
+        tasks=period,
         interactions=interactions,
         envs=64,
         updates=32,

@@ -199,12 +199,18 @@ def test_gradient_scaling_leaves_close_scores_in_order():
     )
 
 
-def test_updates_of_scores_alone_are_scaled():
+@pytest.mark.parametrize(("rate", "factor"), [("step", K), ("gradient", 1)])
+def test_updates_are_scaled_after_the_optimiser(rate, factor):
     params, memory = make().init(KEY)
     updates = jax.tree.map(jnp.ones_like, params)
-    step = make(mode_rate="step").adjust_updates(updates, memory)
-    assert_same(step, updates._replace(scores=K * updates.scores))
-    assert_same(make(mode_rate="gradient").adjust_updates(updates, memory), updates)
+    got = make(mode_rate=rate).adjust_updates(updates, memory)
+    assert_same(got, updates._replace(scores=factor * updates.scores))
+    got = make(mode_rate=rate, adapter_rate=0.5).adjust_updates(updates, memory)
+    expected = updates._replace(
+        adapters=jax.tree.map(lambda u: 0.5 * u, updates.adapters),
+        scores=factor * updates.scores,
+    )
+    assert_same(got, expected)
 
 
 # Contexts
@@ -791,6 +797,7 @@ def test_base_sizes_as_published():
         ({"dropout": 1.0}, "--dropout"),
         ({"tau": 0.0}, "--tau"),
         ({"adapter_tau": -0.1}, "--adapter-tau"),
+        ({"adapter_rate": -1.0}, "--adapter-rate"),
     ],
 )
 def test_senseless_settings_are_told(values, message):

@@ -16,7 +16,7 @@ class Entry(NamedTuple):
       make: `(spec, settings) -> Method`.
       settings: its settings class, made with `config.settings`; `checked()` gives
         settings ready to use or raises `UserError`.
-      preset: `(scenario name, number of distinct tasks) -> settings`.
+      preset: `(scenario name, period) -> settings`; tasks recur after `period`.
     """
 
     make: Callable[[Spec, Any], Method]

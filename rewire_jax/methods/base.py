@@ -80,7 +80,8 @@ class Method(NamedTuple):
         and at the end of each task, or None where nothing is to be chosen.
       end_task: `(params, memory, task, Selection or None) -> params, memory`.
       policy: `(params, memory, task) -> policy` for a task of the sequence, after
-        any number of finished tasks; one not yet seen gets the latest policy.
+        any number of finished tasks; one not yet seen gets the latest policy, or
+        the one that the method knows to belong to it.
       act: `(policy, observation) -> mean, log_std`; a plain function, the same
         object for all members.
       size: `(params, memory) -> []`, the numbers stored for all policies.

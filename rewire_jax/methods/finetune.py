@@ -16,9 +16,9 @@ class Ft1Settings:
         return self
 
 
-def preset(scenario: str, distinct: int) -> Ft1Settings:
+def preset(scenario: str, period: int) -> Ft1Settings:
     """The settings for every scenario."""
-    del scenario, distinct
+    del scenario, period
     return Ft1Settings()
 
 

@@ -28,7 +28,7 @@ class RewireSettings:
         its sum over 512 states.
       distillation: "kl" is Eq. 6; "squares" the authors' sum of squared
         differences of mean and log-std.
-      beta: weight of the alignment loss, or of L2 where alignment is off.
+      beta: weight of the alignment loss.
       alignment: "norm" is Eq. 11; "expanded" the authors' form of it, whose
         gradient in the adapters differs.
       tau: temperature of the wirings' relaxation (Eq. 4).
@@ -93,10 +93,10 @@ _PUBLISHED = {
 }
 
 
-def preset(scenario: str, distinct: int) -> RewireSettings:
-    """Published settings, or the defaults with a head for each distinct task."""
+def preset(scenario: str, period: int) -> RewireSettings:
+    """Published settings, or the defaults with a head for each task of a round."""
     if scenario not in _PUBLISHED:
-        return RewireSettings(head_slots=distinct)
+        return RewireSettings(head_slots=period)
     tau, noise, alpha, beta, slots = _PUBLISHED[scenario]
     return RewireSettings(
         tau=tau,
@@ -202,7 +202,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         for layer in wiring.wire(params.hidden, scores, options.tau):
             key, drop_key = jax.random.split(key)
             x = networks.affine(layer, x)
-            # The authors drop out before the permutation; its entries are exchangeable.
+            # The authors drop out before the permutation: the same but for the variance
+            # of the scores' gradient.
             x = _dropout(drop_key, x, options.dropout)
             x = networks.activate(x)
         head = _at(params.heads, memory.learned % slots)
