@@ -83,14 +83,21 @@ class Run:
             return now
         candidates = program.candidates(self.plan.members, learner, now.stage)
         number = candidates.valid.shape[1]
-        episodes = max(settings.selection_episodes // number, 1)
-        tasks = jax.tree.map(lambda leaf: jnp.stack([leaf] * number), task)
-        keys = self.keys(_SELECTION, 2 * now.stage + phase, number)
-        result = program.rollout(tasks, candidates.policies, keys, episodes)
-        used = jnp.sum(jnp.sum(result.lengths, axis=2) * candidates.valid, axis=1)
+        # They take turns in as many rows as an evaluation has tasks, so that both can
+        # be one compiled function.
+        rows = max(number, settings.tasks)
+        turn = jnp.arange(rows) % number
+        share = jax.nn.one_hot(turn, number) / jnp.bincount(turn, length=number)
+        result = program.rollout(
+            jax.tree.map(lambda leaf: jnp.stack([leaf] * rows), task),
+            jax.tree.map(lambda leaf: leaf[:, turn], candidates.policies),
+            self.keys(_SELECTION, 2 * now.stage + phase, rows),
+            max(settings.selection_episodes // rows, 1),
+        )
+        used = jnp.sum(result.lengths, axis=2) * candidates.valid[:, turn]
         return now._replace(
-            before=jnp.mean(result.returns, axis=2),
-            selection=now.selection + used,
+            before=jnp.mean(result.returns, axis=2) @ share,
+            selection=now.selection + jnp.sum(used, axis=1),
         )
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:

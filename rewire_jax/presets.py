@@ -86,8 +86,8 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         envs=64,
         updates=32,
         warmup=min(2_560, interactions // 4),
-        eval_episodes=8,
-        selection_episodes=12,
+        eval_episodes=4,
+        selection_episodes=4 * period,
         report_every=2_560,
         checkpoint_every=12_800,
         # A temperature that falls from 2 at the paper's rate would keep the policy

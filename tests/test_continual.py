@@ -96,7 +96,7 @@ def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
     assert checkpoints(run) == [f"task-{task:03d}" for task in (1, 2, 3, 4)]
     last = rows(run)[-1]
     assert last["interactions"]["training"] == 4 * 640
-    # Twelve episodes in three modes at start and end of each of four tasks.
+    # Twelve episodes, all modes together, at start and end of each of four tasks.
     steps = make_scenario("probe/reach").environment.episode_length
     assert last["interactions"]["selection"] == 2 * 4 * 12 * steps
     assert len({row["return"] for row in rows(run)}) > 10
@@ -180,16 +180,16 @@ def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     continual.train(settings, tmp_path / "run", scenario=scenario)
     prepared = plan.prepare(settings, scenario)
     program = prepared.program._asdict()
-    act = program.pop("rollout")
+    del program["rollout"]  # looks up the two below
     assert {name: f._cache_size() for name, f in program.items()} == dict.fromkeys(
         program, 1
     )
-    del act
     method = rewire_jax.methods.find_method("rewire")
     made = method.make(prepared.spec, prepared.settings.options)
-    for row, count in ((8, 4), (3, 4)):
-        function = training.rollout_function(scenario.environment, made.act, row, count)
-        assert function._cache_size() >= 1
+    # Evaluation, and selection: twelve episodes in eight rows.
+    for count in (4, 1):
+        function = training.rollout_function(scenario.environment, made.act, 8, count)
+        assert function._cache_size() == 1
     assert len(rows(tmp_path / "run")) == 9 * 8 * 2
 
 
@@ -197,6 +197,7 @@ def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
     copy = tmp_path / "elsewhere"
     subprocess.run(["cp", "-r", str(run), str(copy)], check=True)
     prepared = plan.prepare(tiny())
+    environment = prepared.scenario.environment
     for task, seed in ((0, 0), (2, 1)):
         policy = rewire_jax.load_policy(copy, task=task, seed=seed)
         one = jnp.asarray([0.3, -0.2])
@@ -206,7 +207,6 @@ def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(jax.vmap(policy)(many)[0], single, atol=1e-6)
         np.testing.assert_allclose(policy(many)[0], single, atol=1e-6)
         # It plays as the run's own evaluation says.
-        environment = prepared.scenario.environment
         data = prepared.scenario.tasks[task].data
         saved = [
             row["return"]

@@ -292,10 +292,12 @@ def mixture():
     return Environment(reset, step, 1, 1, endless.episode_length)
 
 
-@pytest.mark.parametrize("time_limit", ["terminal", "bootstrap"])
+@pytest.mark.parametrize(
+    "time_limit", ["terminal", pytest.param("bootstrap", marks=pytest.mark.slow)]
+)
 def test_probe_values_and_actions_are_learned(time_limit):
     environment = mixture()
-    spec = Spec(observations=1, actions=1, hidden=24, depth=2, tasks=1)
+    spec = Spec(observations=1, actions=1, hidden=32, depth=1, tasks=1)
     settings = SacSettings(
         lr_policy=5e-3,
         lr_critic=5e-3,
@@ -310,8 +312,8 @@ def test_probe_values_and_actions_are_learned(time_limit):
     )
     entry = find_method("ft1")
     method = entry.make(spec, entry.preset("", 1))
-    shape = training.Shape(envs=8, updates=4, warmup=12, random=100, transitions=400)
-    steps = 400
+    shape = training.Shape(envs=8, updates=4, warmup=12, random=100, transitions=300)
+    steps = 300
 
     @jax.jit
     def learn(tasks, keys):
