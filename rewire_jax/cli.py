@@ -1,11 +1,15 @@
 """The `rewire-jax` command."""
 
 import argparse
+import contextlib
 import dataclasses
+import io
+import itertools
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, TypeVar
 
 import tyro
 
@@ -15,6 +19,8 @@ from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS
 from rewire_jax.presets import preset
 from rewire_jax.scenarios import list_scenarios, make_scenario
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,6 +85,27 @@ class List:
     json: bool = False
 
 
+def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) -> T:
+    """Reads arguments with tyro.
+
+    Raises:
+      UserError: an argument is unknown, missing or no value of its kind; tyro says
+        so in a box, of which this is the first part, in one line.
+    """
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.cli(
+                kind, prog=f"rewire-jax {name}", args=list(arguments), **options
+            )
+    except SystemExit as exit_:
+        if not exit_.code:
+            raise
+        lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
+        said = list(itertools.takewhile(lambda line: not line.startswith("─"), lines))
+        raise UserError(" ".join(" ".join(said).split())) from None
+
+
 def _train(arguments: Sequence[str]) -> None:
     # The settings' defaults depend on these four, so they are read before the rest.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -94,10 +121,10 @@ def _train(arguments: Sequence[str]) -> None:
     name = arguments[0] if given else "halfcheetah/forgetting"
     scenario = make_scenario(name, known.backend)
     default = preset(scenario, known.method, known.profile)
-    train = tyro.cli(
+    train = parse(
         Train,
-        prog="rewire-jax train SCENARIO",
-        args=list(arguments[1:] if given else arguments),
+        "train SCENARIO",
+        arguments[1:] if given else arguments,
         default=Train(settings=default, out=tyro.MISSING),
         config=(tyro.conf.OmitArgPrefixes,),
     )
@@ -112,7 +139,7 @@ def _train(arguments: Sequence[str]) -> None:
 
 
 def _evaluate(arguments: Sequence[str]) -> None:
-    asked = tyro.cli(Evaluate, prog="rewire-jax evaluate", args=list(arguments))
+    asked = parse(Evaluate, "evaluate", arguments)
     rows = inspection.evaluate(
         asked.run, stage=asked.stage, episodes=asked.episodes, seed=asked.seed
     )
@@ -129,7 +156,7 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
 
 def _info(arguments: Sequence[str]) -> None:
-    asked = tyro.cli(Info, prog="rewire-jax info", args=list(arguments))
+    asked = parse(Info, "info", arguments)
     facts = inspection.info(make_scenario(asked.scenario, asked.backend))
     if asked.json:
         print(json.dumps(facts, indent=1))
@@ -147,7 +174,7 @@ def _info(arguments: Sequence[str]) -> None:
 
 
 def _list(arguments: Sequence[str]) -> None:
-    asked = tyro.cli(List, prog="rewire-jax list", args=list(arguments))
+    asked = parse(List, "list", arguments)
     names = {"scenarios": list(list_scenarios()), "methods": sorted(METHODS)}
     if asked.json:
         print(json.dumps(names, indent=1))

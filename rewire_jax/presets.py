@@ -73,6 +73,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         tasks=len(scenario.tasks),
         interactions=scenario.interactions,
         paper_interactions=scenario.interactions,
+        warmup=min(12_800, scenario.interactions // 4),
         sac=_sac(scenario.name),
         options=find_method(method).preset(scenario.name, period),
     )

@@ -1,0 +1,180 @@
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from rewire_jax import checkpoint, cli
+from rewire_jax.runfolder import HEADER
+
+TINY = [
+    "--method",
+    "ft1",
+    "--profile",
+    "quick",
+    "--tasks",
+    "1",
+    "--interactions",
+    "320",
+    "--envs",
+    "16",
+    "--updates",
+    "1",
+    "--warmup",
+    "160",
+    "--eval-episodes",
+    "2",
+    "--report-every",
+    "160",
+    "--checkpoint-every",
+    "0",
+    "--hidden",
+    "8",
+    "--batch-size",
+    "8",
+]
+
+
+def fails(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([str(word) for word in words])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    return error
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    cli.main(["train", "probe/reach", "--out", str(folder), *TINY])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("halfcheetah/forgeting", "halfcheetah/forgetting"),
+        ("probe/reach --method rewired", "rewire"),
+        ("probe/reach --profile fast", "quick"),
+        ("ant/transfer --backend bullet", "positional"),
+        ("probe/reach --modes 0", "--modes"),
+        ("probe/reach --modes 3 --mode-slots 2", "--mode-slots"),
+        ("probe/reach --beta -1", "--beta"),
+        ("probe/reach --beta nan", "--beta"),
+        ("probe/reach --tau 0", "--tau"),
+        ("probe/reach --dropout 1", "--dropout"),
+        ("probe/reach --seeds 0", "--seeds"),
+        ("probe/reach --seed -1", "--seed"),
+        ("probe/reach --tasks 5", "--tasks"),
+        ("probe/reach --lr-policy 0", "--lr-policy"),
+        ("probe/reach --discount 1.5", "--discount"),
+        ("probe/reach --warmup 20000", "--warmup"),
+        ("probe/reach --envs 0", "--envs"),
+        ("probe/reach --seeds many", "many"),
+        ("probe/reach --sedes 3", "--sedes"),
+        ("probe/reach --time-limit never", "never"),
+        ("", "scenario"),
+    ],
+)
+def test_bad_settings(
+    words: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert named in fails(capsys, "train", *words.split(), "--out", str(out))
+    assert not out.exists()
+
+
+def test_no_out(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--out" in fails(capsys, "train", "probe/reach")
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "evaluate" in fails(capsys, "play")
+
+
+def test_folders_that_do_not_fit(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    train = ["train", "probe/reach", *TINY, "--out"]
+    assert "another run" in fails(capsys, *train, run)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").touch()
+    assert "something else" in fails(capsys, *train, tmp_path / "foreign")
+    assert "holds no run" in fails(capsys, *train, tmp_path / "none", "--resume")
+    changed = fails(capsys, *train, run, "--resume", "--discount", "0.9")
+    assert "--discount was 0.99, not 0.9" in changed
+    assert "holds no run" in fails(capsys, "evaluate", tmp_path / "none")
+    assert "task 3" in fails(capsys, "evaluate", run, "--stage", "3")
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_a_damaged_run(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    newest = checkpoint.available(copy / "checkpoints")[0]
+    for file in newest.rglob("*"):
+        if file.is_file() and file.parent != newest:
+            file.write_bytes(file.read_bytes()[:-1])
+    assert newest.name in fails(capsys, "evaluate", copy)
+    (copy / HEADER).write_text("{")
+    assert "damaged" in fails(capsys, "evaluate", copy)
+    (copy / HEADER).write_text('{"format": 0}')
+    assert "version" in fails(capsys, "evaluate", copy)
+
+
+def test_resuming_what_is_finished_changes_nothing(run: Path) -> None:
+    results = (run / "results.jsonl").read_bytes()
+    cli.main(["train", "probe/reach", "--out", str(run), *TINY, "--resume"])
+    assert (run / "results.jsonl").read_bytes() == results
+
+
+def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["evaluate", str(run), "--episodes", "3", "--json"])
+    row = json.loads(capsys.readouterr().out)
+    assert row["steps"] == 3 * 20
+    cli.main(["evaluate", str(run), "--episodes", "3"])
+    assert f"{row['return']:.1f}" in capsys.readouterr().out
+
+
+def test_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.main(["list", "--json"])
+    names = json.loads(capsys.readouterr().out)
+    assert {"ant/transfer", "humanoid/hard"} <= set(names["scenarios"])
+    assert {"rewire", "ft1"} <= set(names["methods"])
+    cli.main(["list"])
+    assert "halfcheetah/robustness" in capsys.readouterr().out
+    cli.main(["info", "probe/reach", "--json"])
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["interactions"] == 10_000
+    assert [len(task["action_scale"]) for task in facts["tasks"]] == [2] * 4
+    assert facts["model_size"]["ft1"] == 1
+    assert 2 < facts["model_size"]["rewire"] < 2.2
+    cli.main(["info", "probe/reach"])
+    assert "probe/reach" in capsys.readouterr().out
+
+
+def test_help_names_the_settings_and_their_values(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["train", "probe/reach", "--help"])
+    assert exit_.value.code == 0
+    shown = capsys.readouterr().out
+    for flag in ("--interactions", "--lr-policy", "--modes", "--beta", "--resume"):
+        assert flag in shown
+
+
+def test_nothing_is_imported_upward() -> None:
+    # Every module of the package is loaded by now; none may wait for the command.
+    assert "rewire_jax.cli" in sys.modules
+    import rewire_jax
+
+    assert sorted(rewire_jax.__all__) == rewire_jax.__all__
+    assert all(hasattr(rewire_jax, name) for name in rewire_jax.__all__)
