@@ -8,32 +8,21 @@ import pytest
 from rewire_jax import checkpoint, cli
 from rewire_jax.runfolder import HEADER
 
-TINY = [
-    "--method",
-    "ft1",
-    "--profile",
-    "quick",
-    "--tasks",
-    "1",
-    "--interactions",
-    "320",
-    "--envs",
-    "16",
-    "--updates",
-    "1",
-    "--warmup",
-    "160",
-    "--eval-episodes",
-    "2",
-    "--report-every",
-    "160",
-    "--checkpoint-every",
-    "0",
-    "--hidden",
-    "8",
-    "--batch-size",
-    "8",
-]
+TINY = {
+    "--method": "ft1",
+    "--profile": "quick",
+    "--tasks": 1,
+    "--interactions": 320,
+    "--envs": 16,
+    "--updates": 1,
+    "--warmup": 160,
+    "--eval-episodes": 2,
+    "--report-every": 160,
+    "--checkpoint-every": 0,
+    "--hidden": 8,
+    "--batch-size": 8,
+}
+TINY = [str(word) for pair in TINY.items() for word in pair]
 
 
 def fails(capsys: pytest.CaptureFixture[str], *words: str) -> str:
