@@ -1,8 +1,8 @@
 """Updates a second against the machine's own rate for matrix products.
 
 Run by `make bench-speed`. All loops are compiled and timed in turn, round after
-round, so that a busy machine disturbs all alike; the best round counts. Figures hold
-for their machine only: what can be compared are the ratios.
+round, so that a busy machine disturbs all alike. Rates are those of the best round
+and hold for their machine only; ratios are medians of those within one round.
 """
 
 import json
@@ -120,18 +120,11 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
     """
     plan = prepare(settings)
     spec, make = plan.spec, find_method(settings.method).make
-    numbers = jax.random.normal(
-        jax.random.key(1), (32, settings.sac.batch_size, 2 * spec.observations + 1)
-    )
-    ended = jnp.zeros(numbers.shape[:2], bool)
-    batches = Batch(
-        observation=numbers[..., : spec.observations],
-        action=jnp.tanh(numbers[..., : spec.actions]),
-        reward=numbers[..., -1],
-        terminal=ended,
-        truncated=ended,
-        next_observation=numbers[..., spec.observations : -1],
-    )
+    o, shape = spec.observations, (32, settings.sac.batch_size)
+    numbers = jax.random.normal(jax.random.key(1), (*shape, 2 * o + 1))
+    action, ended = jnp.tanh(numbers[..., : spec.actions]), jnp.zeros(shape, bool)
+    first, reward, second = numbers[..., :o], numbers[..., -1], numbers[..., o:-1]
+    batches = Batch(first, action, reward, ended, ended, second)
 
     def begin(member):
         method = make(spec, member.options)
@@ -181,7 +174,7 @@ def timed(loop: Loop, count: int) -> float:
 
 
 def in_turn(loops: dict[str, Loop], rounds: int, seconds: float) -> dict[str, Any]:
-    """Times all loops in turn; rates are repetitions a second, best and median."""
+    """Times all loops in turn; `best` and `median` are repetitions a second."""
     counts = {}
     for name, loop in loops.items():
         timed(loop, 2)  # compiles
@@ -190,9 +183,12 @@ def in_turn(loops: dict[str, Loop], rounds: int, seconds: float) -> dict[str, An
     figures = {}
     for name, count in counts.items():
         times = [one[name] for one in taken]
-        best, median = count / min(times), count / statistics.median(times)
-        figures[name] = {"count": count, "seconds": times, "best": best}
-        figures[name]["median"] = median
+        figures[name] = {
+            "count": count,
+            "seconds": times,
+            "best": count / min(times),
+            "median": count / statistics.median(times),
+        }
     return figures
 
 
@@ -212,12 +208,9 @@ def run(bench: Bench) -> dict[str, Any]:
         delays[1] = replace(common, policy_delay=1, target_delay=1)
     spec = prepare(methods["rewire"]).spec
     critics, policy = products(spec, common.batch_size)
-    shapes = critics + policy
-    loops = {"square": product_loop(SQUARE), "shapes": product_loop(shapes)}
-    needed: dict[str, float] = {
-        "square": multiply_adds(SQUARE),
-        "shapes": multiply_adds(shapes),
-    }
+    loops, needed = {}, {}
+    for name, some in (("square", SQUARE), ("shapes", critics + policy)):
+        loops[name], needed[name] = product_loop(some), float(multiply_adds(some))
     for delay, chosen in delays.items():
         for name, settings in methods.items():
             loops[f"{name}/{delay}"] = update_loop(replace(settings, sac=chosen))
@@ -226,13 +219,20 @@ def run(bench: Bench) -> dict[str, Any]:
     load = [os.getloadavg()]
     figures = in_turn(loops, rounds, seconds)
     load.append(os.getloadavg())
-    rate = figures["square"]["best"] * needed["square"]
+
+    def times_faster(name, other):
+        """How often the one repeats while the other does once, in the same round."""
+        here, there = figures[name], figures[other]
+        pairs = zip(here["seconds"], there["seconds"], strict=True)
+        ratio = statistics.median(theirs / ours for ours, theirs in pairs)
+        return ratio * here["count"] / there["count"]
+
     for name, count in needed.items():
-        figures[name]["multiply_adds"] = count
-        figures[name]["share"] = figures[name]["best"] * count / rate
+        share = times_faster(name, "square") * count / needed["square"]
+        figures[name] |= {"multiply_adds": count, "share": share}
     for delay in delays:
-        plain, rewire = figures[f"plain/{delay}"], figures[f"rewire/{delay}"]
-        rewire["cost"] = plain["best"] / rewire["best"]
+        cost = times_faster(f"plain/{delay}", f"rewire/{delay}")
+        figures[f"rewire/{delay}"]["cost"] = cost
     result = provenance() | {
         "load": load,
         "sizes": spec._asdict() | {"batch": common.batch_size},
@@ -258,14 +258,13 @@ def table(result: dict[str, Any]) -> str:
     square = result["loops"]["square"]
     flops = 2e-9 * square["multiply_adds"] * square["best"]
     before, after = (load[0] for load in result["load"])
+    device = f"{result['device']}, load {before:.1f} to {after:.1f}"
     return "\n".join(
         [
-            f"{result['device']}, load {before:.1f} to {after:.1f}; "
-            f"float32 products at {flops:.0f} GFLOP/s",
+            f"{device}; float32 products at {flops:.0f} GFLOP/s",
             *lines,
             "best, median: a second; plain/2: with the policy at every 2nd update",
-            "share: of the rate of square products, by multiply-adds needed",
-            "cost: in plain updates",
+            "share: of the rate of square products; cost: in plain updates",
         ]
     )
 

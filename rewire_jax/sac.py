@@ -108,34 +108,51 @@ def _step(gradient, state, value, rate):
     return jax.tree.map(lambda u: -rate * u, update), state
 
 
-def _update_policy(learner, batch, key, method, sac):
+class _Actor(NamedTuple):
+    """What an update of the policy changes."""
+
+    params: Params
+    log_temperature: jax.Array
+    optimizers: tuple[Any, Any]
+
+
+def _update_policy(actor, learner, batch, key, method, sac):
     gradient, metrics = jax.grad(_policy_loss, has_aux=True)(
-        learner.params, learner, batch, key, method
+        actor.params, learner, batch, key, method
     )
-    policy_state, critic_state, temperature_state = learner.optimizers
-    updates, policy_state = _step(gradient, policy_state, learner.params, sac.lr_policy)
+    policy_state, temperature_state = actor.optimizers
+    updates, policy_state = _step(gradient, policy_state, actor.params, sac.lr_policy)
     updates = method.adjust_updates(updates, learner.memory)
     actions = batch.action.shape[-1]
     surplus = metrics["entropy"] + sac.target_multiplier * actions
     # d/d log_temperature of temperature * (entropy - target entropy)
-    temperature = jnp.exp(learner.log_temperature)
+    temperature = jnp.exp(actor.log_temperature)
     step, temperature_state = _step(
         temperature * surplus,
         temperature_state,
-        learner.log_temperature,
+        actor.log_temperature,
         sac.lr_temperature,
     )
-    return learner._replace(
-        params=optax.apply_updates(learner.params, updates),
-        log_temperature=learner.log_temperature + step,
-        optimizers=(policy_state, critic_state, temperature_state),
+    return _Actor(
+        params=optax.apply_updates(actor.params, updates),
+        log_temperature=actor.log_temperature + step,
+        optimizers=(policy_state, temperature_state),
     ), metrics | {"temperature": temperature}
+
+
+def _actor(learner: Learner) -> _Actor:
+    policy_state, _, temperature_state = learner.optimizers
+    return _Actor(
+        learner.params, learner.log_temperature, (policy_state, temperature_state)
+    )
 
 
 def policy_metrics(learner: Learner, batch: Batch, method: Method, sac: SacSettings):
     """Zeros in the shape of a policy update's metrics, to carry through a loop."""
     shapes = jax.eval_shape(
-        lambda: _update_policy(learner, batch, jax.random.key(0), method, sac)[1]
+        lambda: _update_policy(
+            _actor(learner), learner, batch, jax.random.key(0), method, sac
+        )[1]
     )
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
@@ -165,27 +182,30 @@ def update(
     (loss, q), gradient = jax.value_and_grad(_critic_loss, has_aux=True)(
         learner.critic, learner, batch, critic_key, method, sac
     )
-    policy_state, critic_state, temperature_state = learner.optimizers
+    _, critic_state, _ = learner.optimizers
     step, critic_state = _step(gradient, critic_state, learner.critic, sac.lr_critic)
-    learner = learner._replace(
-        critic=optax.apply_updates(learner.critic, step),
-        optimizers=(policy_state, critic_state, temperature_state),
-    )
-    learner, policy = jax.lax.cond(
+    critic = optax.apply_updates(learner.critic, step)
+    learner = learner._replace(critic=critic)
+    # Only what a branch changes goes through it: the rest would be copied.
+    actor, policy = jax.lax.cond(
         count % sac.policy_delay == 0,
-        lambda learner: _update_policy(learner, batch, policy_key, method, sac),
-        lambda learner: (
-            learner,
+        lambda actor: _update_policy(actor, learner, batch, policy_key, method, sac),
+        lambda actor: (
+            actor,
             {k: v for k, v in metrics.items() if k not in ("critic_loss", "q")},
         ),
-        learner,
+        _actor(learner),
     )
     target = jax.lax.cond(
         count % sac.target_delay == 0,
-        lambda target: optax.incremental_update(
-            learner.critic, target, sac.target_rate
-        ),
+        lambda target: optax.incremental_update(critic, target, sac.target_rate),
         lambda target: target,
         learner.target,
     )
-    return learner._replace(target=target), policy | {"critic_loss": loss, "q": q}
+    policy_state, temperature_state = actor.optimizers
+    return learner._replace(
+        params=actor.params,
+        log_temperature=actor.log_temperature,
+        target=target,
+        optimizers=(policy_state, critic_state, temperature_state),
+    ), policy | {"critic_loss": loss, "q": q}
