@@ -29,6 +29,7 @@ class Bench:
       seed: of the first member.
       backend: physics backend.
       out: folder for runs and report; named after scenario and profile if not given.
+      keep: also put the report under experiments/results, to be committed.
     """
 
     scenario: str = "halfcheetah/forgetting"
@@ -38,6 +39,7 @@ class Bench:
     seed: int = 0
     backend: str = "positional"
     out: Path | None = None
+    keep: bool = False
 
 
 def run(bench: Bench) -> None:
@@ -70,6 +72,8 @@ def run(bench: Bench) -> None:
             resume=started,
         )
     print(to_terminal(rewire_jax.write_report(folders, out)))
+    if bench.keep:
+        rewire_jax.write_report(folders, Path("experiments/results") / name)
     for folder in folders:
         print(f"checkpoints: {folder / 'checkpoints'}")
 

@@ -201,8 +201,9 @@ def _figure(
 
 
 def _entitle(figure: Figure, title: str, reading: str) -> None:
-    lines = textwrap.wrap(title, width=int(11 * figure.get_figwidth()))
-    figure.suptitle("\n".join([*lines, reading]))
+    width = int(11 * figure.get_figwidth())
+    lines = [*textwrap.wrap(title, width), *textwrap.wrap(reading, width)]
+    figure.suptitle("\n".join(lines), fontsize=11)
 
 
 def _look(i: int) -> dict[str, Any]:
