@@ -75,11 +75,11 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         paper_interactions=scenario.interactions,
         warmup=min(12_800, scenario.interactions // 4),
         sac=_sac(scenario.name),
-        options=find_method(method).preset(scenario.name, period),
+        options=find_method(method).preset(scenario.name, period, profile),
     )
     if profile == "paper":
         return paper
-    interactions = min(30_000, scenario.interactions)
+    interactions = min(25_600, scenario.interactions)
     return dataclasses.replace(
         paper,
         tasks=period,
@@ -97,7 +97,6 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
             paper.sac,
             hidden=128,
             lr_critic=1e-3,
-            initial_temperature=0.2,
-            lr_temperature=1e-3,
+            initial_temperature=0.1,
         ),
     )

@@ -807,12 +807,12 @@ def test_senseless_settings_are_told(values, message):
 
 def test_presets():
     entry = find_method("rewire")
-    cheetah = entry.preset("halfcheetah/forgetting", 4)
+    cheetah = entry.preset("halfcheetah/forgetting", 4, "paper")
     assert (cheetah.tau, cheetah.noise, cheetah.dropout) == (1.0, 0.1, 0.0)
     assert (cheetah.alpha, cheetah.beta, cheetah.head_slots) == (1e-5, 100.0, 4)
-    ant = entry.preset("ant/robustness", 2)
+    ant = entry.preset("ant/robustness", 2, "paper")
     assert (ant.tau, ant.noise, ant.dropout) == (0.1, 0.0, 0.1)
     assert (ant.alpha, ant.beta, ant.head_slots) == (1e-5, 0.1, 2)
-    assert entry.preset("my/own", 7).head_slots == 7
+    assert entry.preset("my/own", 7, "paper").head_slots == 7
     assert cheetah.modes == 3
     assert cheetah.checked().mode_slots == 3

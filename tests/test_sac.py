@@ -35,7 +35,7 @@ PENALTY = 0.05
 
 def make_method(spec):
     """FT-1 with a penalty of its own."""
-    method = find_method("ft1").make(spec, find_method("ft1").preset("", 1))
+    method = find_method("ft1").make(spec, find_method("ft1").preset("", 1, "paper"))
 
     def penalty(key, params, memory, context, observation, gaussian):
         value = sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(params))
@@ -311,7 +311,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
         time_limit=time_limit,
     )
     entry = find_method("ft1")
-    method = entry.make(spec, entry.preset("", 1))
+    method = entry.make(spec, entry.preset("", 1, "paper"))
     shape = training.Shape(envs=8, updates=4, warmup=12, random=100, transitions=300)
     steps = 300
 

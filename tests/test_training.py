@@ -43,7 +43,7 @@ SEEDS = (3, 8)
 
 def options(method, number):
     """The settings of a method's configuration number 0 or 1."""
-    settings = find_method(method).preset("probe/reach", len(TASKS))
+    settings = find_method(method).preset("probe/reach", len(TASKS), "paper")
     if method == "rewire":
         changes = {"modes": 2 + number, "alpha": 0.1**number, "tau": 1 / (1 + number)}
         settings = dataclasses.replace(settings, mode_slots=3, **changes)

@@ -16,12 +16,13 @@ class Entry(NamedTuple):
       make: `(spec, settings) -> Method`.
       settings: its settings class, made with `config.settings`; `checked()` gives
         settings ready to use or raises `UserError`.
-      preset: `(scenario name, period) -> settings`; tasks recur after `period`.
+      preset: `(scenario name, period, profile) -> settings`; tasks recur after
+        `period` places.
     """
 
     make: Callable[[Spec, Any], Method]
     settings: type
-    preset: Callable[[str, int], Any]
+    preset: Callable[[str, int, str], Any]
 
 
 METHODS: dict[str, Entry] = {

@@ -16,9 +16,9 @@ class Ft1Settings:
         return self
 
 
-def preset(scenario: str, period: int) -> Ft1Settings:
-    """The settings for every scenario."""
-    del scenario, period
+def preset(scenario: str, period: int, profile: str) -> Ft1Settings:
+    """The settings for every scenario and profile."""
+    del scenario, period, profile
     return Ft1Settings()
 
 
