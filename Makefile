@@ -80,7 +80,8 @@ bench-brax: setup ## Run the methods on a Brax scenario, make its table and figu
 		$(call option,seeds,$(SEEDS)) \
 		$(call option,seed,$(SEED)) \
 		$(call option,backend,$(BACKEND)) \
-		$(call option,out,$(OUT)))
+		$(call option,out,$(OUT)) \
+		$(if $(KEEP),--keep))
 
 bench-speed: setup ## Measure interactions and updates a second
 	$(RUN) -m experiments.bench_speed
