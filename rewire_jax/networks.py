@@ -13,20 +13,21 @@ class Linear(NamedTuple):
     """An affine layer.
 
     Attributes:
-      kernel: `[inputs, outputs]`.
+      weight: `[outputs, inputs]`, the W of W x + b: reordering a layer's output
+        moves whole rows, and its gradient needs no transposition.
       bias: `[outputs]`.
     """
 
-    kernel: jax.Array
+    weight: jax.Array
     bias: jax.Array
 
 
 def init_linear(key: jax.Array, inputs: int, outputs: int) -> Linear:
     """A layer uniform in ±1/sqrt(inputs), weights and bias (PyTorch's default)."""
     bound = inputs**-0.5
-    kernel_key, bias_key = jax.random.split(key)
+    weight_key, bias_key = jax.random.split(key)
     return Linear(
-        jax.random.uniform(kernel_key, (inputs, outputs), minval=-bound, maxval=bound),
+        jax.random.uniform(weight_key, (outputs, inputs), minval=-bound, maxval=bound),
         jax.random.uniform(bias_key, (outputs,), minval=-bound, maxval=bound),
     )
 
@@ -44,7 +45,8 @@ def activate(x: jax.Array) -> jax.Array:
 
 def affine(layer: Linear, x: jax.Array) -> jax.Array:
     """`[..., inputs]` -> `[..., outputs]`."""
-    return x @ layer.kernel + layer.bias
+    contract_inputs = (((x.ndim - 1,), (1,)), ((), ()))
+    return jax.lax.dot_general(x, layer.weight, contract_inputs) + layer.bias
 
 
 def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:

@@ -1,5 +1,7 @@
 """The permutation operator: hard orders forward, SoftSort gradients backward."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
@@ -32,29 +34,82 @@ def _forward(x, scores, tau):
 
 def _backward(residuals, gradient):
     permuted, order, scores, tau = residuals
-    tau = jnp.asarray(tau)  # A constant comes back from jit as a plain number.
     n = order.shape[0]
     wide = jnp.promote_types(permuted.dtype, jnp.float32)
-    # In the sorted basis both axes of the relaxation follow the sorted scores, so
-    # no n x n array is ever gathered; only the n results go back to their places.
     outer = jnp.einsum(
         "bi,bj->ij",
         gradient.reshape(-1, n).astype(wide),
         permuted.reshape(-1, n).astype(wide),
     )
-    sorted_scores = scores[order].astype(wide)
-    difference = sorted_scores[:, None] - sorted_scores[None, :]
-    soft = jax.nn.softmax(-jnp.abs(difference) / tau.astype(wide), axis=-1)
-    logits = soft * (outer - jnp.sum(soft * outer, axis=-1, keepdims=True))
-    # At ties the sign is +1, JAX's own derivative of abs at 0.
-    slope = jnp.where(difference >= 0, logits, -logits) / tau.astype(wide)
-    in_sorted = jnp.sum(slope, axis=0) - jnp.sum(slope, axis=1)
-    inverse = jnp.argsort(order)
+    inverse = _invert(order)
     return (
         jnp.take(gradient, inverse, axis=-1).astype(permuted.dtype),
-        in_sorted[inverse].astype(scores.dtype),
+        _score_gradient(outer, order, inverse, scores, tau),
         jnp.zeros_like(tau),
     )
 
 
 permute.defvjp(_forward, _backward)
+
+
+@jax.custom_vjp
+def permute_rows(
+    arrays: Sequence[jax.Array], scores: jax.Array, tau: jax.typing.ArrayLike
+) -> list[jax.Array]:
+    """`permute` on the first axis of several arrays `[n, ...]` at once.
+
+    Reordering the rows of a layer's weights reorders its output, so this gives the
+    same gradients as `permute` on the output, whatever the size of the batch.
+    """
+    order = jnp.argsort(scores)
+    return [jnp.take(x, order, axis=0) for x in arrays]
+
+
+def _rows_forward(arrays, scores, tau):
+    order = jnp.argsort(scores)
+    permuted = [jnp.take(x, order, axis=0) for x in arrays]
+    return permuted, (permuted, order, scores, tau)
+
+
+def _rows_backward(residuals, gradients):
+    permuted, order, scores, tau = residuals
+    n = order.shape[0]
+    outer = sum(
+        g.reshape(n, -1) @ x.reshape(n, -1).T
+        for g, x in zip(gradients, permuted, strict=True)
+    )
+    inverse = _invert(order)
+    return (
+        [jnp.take(g, inverse, axis=0) for g in gradients],
+        _score_gradient(outer, order, inverse, scores, tau),
+        jnp.zeros_like(tau),
+    )
+
+
+permute_rows.defvjp(_rows_forward, _rows_backward)
+
+
+def _invert(order):
+    places = jnp.arange(order.shape[0], dtype=order.dtype)
+    return jnp.zeros_like(order).at[order].set(places, unique_indices=True)
+
+
+def _score_gradient(outer, order, inverse, scores, tau):
+    """Gradient in the scores, given `outer[i, j] = <gradient_i, permuted_j>`.
+
+    In the sorted basis both axes of the relaxation follow the sorted scores, so no
+    n x n array is ever gathered; only the n results go back to their places.
+    """
+    ordered = scores[order].astype(outer.dtype)
+    tau = jnp.asarray(tau, outer.dtype)
+    difference = ordered[:, None] - ordered[None, :]
+    # The diagonal is 1 and nothing is larger: a softmax without its maximum.
+    near = jnp.exp(-jnp.abs(difference) / tau)
+    weight = 1 / jnp.sum(near, axis=1)
+    both = near * outer
+    centre = jnp.sum(both, axis=1) * weight
+    # At ties the sign is +1, JAX's own derivative of abs at 0.
+    rate = (weight / tau)[:, None]
+    slope = jnp.where(difference >= 0, rate, -rate) * (both - near * centre[:, None])
+    in_sorted = jnp.sum(slope, axis=0) - jnp.sum(slope, axis=1)
+    return in_sorted[inverse].astype(scores.dtype)

@@ -21,27 +21,27 @@ def density(action, mean, std):
 def test_layers_are_uniform_within_torchs_bound():
     sizes = [9, 200, 50]
     layers = jax.jit(lambda key: networks.init_mlp(key, sizes))(KEY)
-    assert [layer.kernel.shape for layer in layers] == [(9, 200), (200, 50)]
+    assert [layer.weight.shape for layer in layers] == [(200, 9), (50, 200)]
     assert [layer.bias.shape for layer in layers] == [(200,), (50,)]
     for layer, inputs in zip(layers, sizes, strict=False):
         for values in layer:
             scaled = np.ravel(values) * np.sqrt(inputs)
             assert np.abs(scaled).max() <= 1 + 1e-6
             assert stats.kstest(scaled, stats.uniform(-1, 2).cdf).pvalue > 1e-4
-    assert not np.any(np.isin(layers[0].kernel, layers[0].bias))
+    assert not np.any(np.isin(layers[0].weight, layers[0].bias))
 
 
 def test_mlp_is_affine_layers_with_leaky_relu_between():
     random = np.random.default_rng(0)
     sizes = [3, 7, 5, 2]
     layers = [
-        networks.Linear(random.normal(size=pair), random.normal(size=pair[1]))
+        networks.Linear(random.normal(size=pair[::-1]), random.normal(size=pair[1]))
         for pair in itertools.pairwise(sizes)
     ]
     inputs = random.normal(size=(4, 6, 3))
     x = inputs
-    for number, (kernel, bias) in enumerate(layers):
-        x = x @ kernel + bias
+    for number, (weight, bias) in enumerate(layers):
+        x = x @ weight.T + bias
         if number < 2:
             x = np.where(x > 0, x, 0.2 * x)
     np.testing.assert_allclose(

@@ -80,10 +80,10 @@ def selection(after, before=0.0):
 def play(hidden, orders, head, observation=OBSERVATION):
     """Eq. 2 and 3 in numpy: mean, log-std."""
     x = observation.astype(np.float64)
-    for (kernel, bias), z in zip(hidden, orders, strict=True):
-        x = (x @ np.asarray(kernel, np.float64) + bias)[:, z]
+    for (weight, bias), z in zip(hidden, orders, strict=True):
+        x = (x @ np.asarray(weight.T, np.float64) + bias)[:, z]
         x = np.where(x > 0, x, 0.2 * x)
-    output = x @ np.asarray(head.kernel, np.float64) + head.bias
+    output = x @ np.asarray(head.weight.T, np.float64) + head.bias
     return output[:, :ACTIONS], np.clip(output[:, ACTIONS:], -20, 2)
 
 
@@ -164,13 +164,13 @@ def test_only_the_mode_in_use_learns_in_all_layers(rate):
 
     def dense(scores):
         x = OBSERVATION
-        for (kernel, bias), v in zip(params.hidden, scores[1], strict=True):
+        for (weight, bias), v in zip(params.hidden, scores[1], strict=True):
             difference = jnp.sort(v)[:, None] - v[None, :]
             soft = jax.nn.softmax(-jnp.abs(difference) / 0.5, axis=-1)
             hard = jnp.eye(N)[jnp.argsort(v)]
-            x = (x @ kernel + bias) @ (hard + soft - jax.lax.stop_gradient(soft)).T
+            x = (x @ weight.T + bias) @ (hard + soft - jax.lax.stop_gradient(soft)).T
             x = jnp.where(x > 0, x, 0.2 * x)
-        output = x @ params.heads.kernel[0] + params.heads.bias[0]
+        output = x @ params.heads.weight[0].T + params.heads.bias[0]
         mean, log_std = output[:, :ACTIONS], output[:, ACTIONS:]
         return jnp.sum(jnp.sin(mean) + log_std**2)
 
@@ -258,9 +258,9 @@ def test_dropout_has_its_rate_and_keeps_the_mean():
     context = Context(0, np.zeros((1, N), np.float32), jax.random.split(KEY, number))
     draw = jax.vmap(method.distribution, (None, None, Context(None, None, 0), None))
     means = np.asarray(draw(params, memory, context, OBSERVATION)[0], np.float64)
-    (kernel, bias), head = params.hidden[0], head_at(params, 0)
-    x = OBSERVATION @ kernel + bias
-    terms = np.where(x > 0, x, 0.2 * x)[:, :, None] * head.kernel[None, :, :ACTIONS]
+    (weight, bias), head = params.hidden[0], head_at(params, 0)
+    x = OBSERVATION @ weight.T + bias
+    terms = np.where(x > 0, x, 0.2 * x)[:, :, None] * head.weight.T[None, :, :ACTIONS]
     expected = terms.sum(axis=1) + head.bias[:ACTIONS]
     variance = rate / (1 - rate) * np.sum(np.square(terms), axis=1)
     error = np.sqrt(variance / number)
@@ -369,12 +369,12 @@ def test_distillation_draws_the_mode_to_the_others(form):
 
     def dense(params):
         x = OBSERVATION
-        for (kernel, bias), z in zip(
+        for (weight, bias), z in zip(
             params.hidden, orders_of(params_scores[mode]), strict=True
         ):
-            x = x @ kernel[:, z] + bias[z]
+            x = x @ weight[z].T + bias[z]
             x = jnp.where(x > 0, x, 0.2 * x)
-        x = x @ params.heads.kernel[0] + params.heads.bias[0]
+        x = x @ params.heads.weight[0].T + params.heads.bias[0]
         mean, log_std = x[:, :ACTIONS], x[:, ACTIONS:]
         p_mean, p_log_std = target
         if form == "squares":
@@ -590,11 +590,11 @@ def test_policies_survive_a_permutation_of_the_weights():
     changed = trained(rng, began, slot=2)
     out, inp = (orders_of(scores) for scores in changed.adapters)
     moved = []
-    for index, (kernel, bias) in enumerate(params.hidden):
-        kernel = np.asarray(kernel)[:, out[index]]
+    for index, (weight, bias) in enumerate(params.hidden):
+        weight = np.asarray(weight)[out[index]]
         if index:
-            kernel = kernel[inp[index - 1]]
-        moved.append(Linear(kernel, np.asarray(bias)[out[index]]))
+            weight = weight[:, inp[index - 1]]
+        moved.append(Linear(weight, np.asarray(bias)[out[index]]))
     changed = changed._replace(hidden=tuple(moved))
     done, kept = method.end_task(changed, memory, 2, selection([1, 3, 2]))
     assert np.any(kept.orders[:2] != memory.orders[:2])

@@ -110,8 +110,8 @@ def wide(tree):
 
 
 def net(layers, x):
-    for number, (kernel, bias) in enumerate(layers):
-        x = x @ kernel + bias
+    for number, (weight, bias) in enumerate(layers):
+        x = x @ weight.T + bias
         if number < len(layers) - 1:
             x = np.where(x > 0, x, 0.2 * x)
     return x
@@ -265,8 +265,8 @@ def test_a_task_starts_with_fresh_optimisers_and_kept_critics():
     assert again.log_temperature == pytest.approx(np.log(0.7))
     assert all(same(again.optimizers, learner.optimizers))
     # The two critics do not start alike.
-    kernel = learner.critic[0].kernel
-    assert not np.any(kernel[0] == kernel[1])
+    weight = learner.critic[0].weight
+    assert not np.any(weight[0] == weight[1])
 
 
 # Probes with one-number observations and actions, learned side by side.

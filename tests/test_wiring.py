@@ -21,7 +21,7 @@ def double():
 
 def make_layers(rng, sizes):
     return tuple(
-        Linear(rng.normal(size=(a, b)) / np.sqrt(a), rng.normal(size=b))
+        Linear(rng.normal(size=(b, a)) / np.sqrt(a), rng.normal(size=b))
         for a, b in itertools.pairwise(sizes)
     )
 
@@ -92,9 +92,9 @@ def test_wired_network_equals_permuted_activations(double):
     def dense(hidden, head, scores, tau):
         x = observation
         for layer, v in zip(hidden, scores, strict=True):
-            x = (x @ layer.kernel + layer.bias) @ straight_through(v, tau).T
+            x = (x @ layer.weight.T + layer.bias) @ straight_through(v, tau).T
             x = jnp.where(x > 0, x, 0.2 * x)
-        return x @ head.kernel + head.bias
+        return x @ head.weight.T + head.bias
 
     def both(function, tau):
         value, pull = jax.vjp(
@@ -116,25 +116,25 @@ def test_fold_is_the_value_of_wire(double):
     wired = wiring.wire(hidden, jnp.asarray(sorting_into(rng, orders)), 0.1)
     folded = wiring.fold(hidden, orders)
     for a, b, layer, z in zip(wired, folded, hidden, orders, strict=True):
-        np.testing.assert_array_equal(a.kernel, b.kernel)
+        np.testing.assert_array_equal(a.weight, b.weight)
         np.testing.assert_array_equal(a.bias, b.bias)
-        np.testing.assert_array_equal(b.kernel, layer.kernel @ matrix(z).T)
+        np.testing.assert_array_equal(b.weight, matrix(z) @ layer.weight)
         np.testing.assert_array_equal(b.bias, matrix(z) @ layer.bias)
 
 
 def realigned(rng, depth):
     """Layers, the same with their neurons moved, and the adapters that tell how.
 
-    W = P' W_prev P''^T by matrix products; a kernel is a W transposed.
+    W = P' W_prev P''^T by matrix products.
     """
     previous = make_hidden(rng, depth)
     out, inp = make_orders(rng, depth), make_orders(rng, depth - 1)
     hidden = []
-    for index, (kernel, bias) in enumerate(previous):
-        weight = matrix(out[index]) @ kernel.T
+    for index, (weight, bias) in enumerate(previous):
+        weight = matrix(out[index]) @ weight
         if index:
             weight = weight @ matrix(inp[index - 1]).T
-        hidden.append(Linear(weight.T, matrix(out[index]) @ bias))
+        hidden.append(Linear(weight, matrix(out[index]) @ bias))
     adapters = wiring.Adapters(sorting_into(rng, out), sorting_into(rng, inp))
     return previous, tuple(hidden), jax.tree.map(jnp.asarray, adapters)
 
@@ -142,9 +142,9 @@ def realigned(rng, depth):
 def play(hidden, head, orders, observation):
     """A wired policy in numpy, Eq. 2 and 3."""
     x = observation
-    for (kernel, bias), z in zip(hidden, orders, strict=True):
-        x = leaky((x @ kernel + bias)[:, z])
-    return x @ head.kernel + head.bias
+    for (weight, bias), z in zip(hidden, orders, strict=True):
+        x = leaky((x @ weight.T + bias)[:, z])
+    return x @ head.weight.T + head.bias
 
 
 @pytest.mark.parametrize("depth", [1, 2, 3])
@@ -172,7 +172,7 @@ def test_exact_recovery(depth, double):
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
 
     for index, layer in enumerate(wiring.adapt(previous, adapters, 0.1)):
-        np.testing.assert_array_equal(layer.kernel, hidden[index].kernel)
+        np.testing.assert_array_equal(layer.weight, hidden[index].weight)
         np.testing.assert_array_equal(layer.bias, hidden[index].bias)
     assert wiring.alignment_loss(hidden, previous, adapters, 0.1) == 0
 
@@ -217,10 +217,10 @@ def test_alignment_loss_equals_the_dense_form(form, double):
         loss = 0.0
         for index in range(depth):
             left = straight_through(adapters.out[index], tau)
-            weight = left @ previous[index].kernel.T
+            weight = left @ previous[index].weight
             if index:
                 weight = weight @ straight_through(adapters.inp[index - 1], tau).T
-            pairs = [(hidden[index].kernel.T, weight)]
+            pairs = [(hidden[index].weight, weight)]
             pairs.append((hidden[index].bias, left @ previous[index].bias))
             for now, then in pairs:
                 if form == "norm":
@@ -266,7 +266,7 @@ def test_descent_finds_a_permutation(double):
     swapped[[3, 4]] = [4, 3]
     orders = np.tile(np.arange(N), (2, 1))
     hidden = list(wiring.fold(previous, np.stack([swapped, orders[1]])))
-    hidden[1] = hidden[1]._replace(kernel=hidden[1].kernel[swapped])
+    hidden[1] = hidden[1]._replace(weight=hidden[1].weight[:, swapped])
     adapters = wiring.identity_adapters(2, N)
     loss = jax.jit(jax.value_and_grad(wiring.alignment_loss, 2))
     first, _ = loss(hidden, previous, adapters, 0.1)

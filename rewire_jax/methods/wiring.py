@@ -1,8 +1,8 @@
 """Wirings: orders of hidden neurons, their cache, and alignment with the weights.
 
 A wiring of L hidden layers of n neurons is an order z `[L, n]`: layer l computes
-`activate((x @ kernel_l + bias_l)[..., z_l])` (Eq. 2, 3). Reordering a layer's output
-is reordering the columns of its weights, so a wired network is an ordinary MLP.
+`activate((weight_l @ x + bias_l)[z_l])` (Eq. 2, 3). Reordering a layer's output is
+reordering the rows of its weights, so a wired network is an ordinary MLP.
 
 Adapters describe how the current weights differ from the previous ones by a
 permutation: `out_l` (P'_l) of a layer's neurons, `inp_l` (P''_l) of its inputs. The
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from rewire_jax.networks import Linear
-from rewire_jax.permutation import permute
+from rewire_jax.permutation import permute, permute_rows
 
 Hidden = Sequence[Linear]
 
@@ -52,9 +52,7 @@ def permute_outputs(layer: Linear, scores: jax.Array, tau: ArrayLike) -> Linear:
     Both gradients are those of permuting the output, summed over the batch, at
     the cost of a permutation of the weights.
     """
-    stacked = jnp.concatenate([layer.kernel, layer.bias[None]])
-    permuted = permute(stacked, scores, tau)
-    return Linear(permuted[:-1], permuted[-1])
+    return Linear(*permute_rows(list(layer), scores, tau))
 
 
 def wire(hidden: Hidden, scores: jax.Array, tau: ArrayLike) -> list[Linear]:
@@ -66,17 +64,17 @@ def wire(hidden: Hidden, scores: jax.Array, tau: ArrayLike) -> list[Linear]:
 
 def fold(hidden: Hidden, orders: jax.Array) -> list[Linear]:
     """The same for fixed orders `[L, n]`."""
-    return [Linear(w[:, z], b[z]) for (w, b), z in zip(hidden, orders, strict=True)]
+    return [Linear(w[z], b[z]) for (w, b), z in zip(hidden, orders, strict=True)]
 
 
 def adapt(previous: Hidden, adapters: Adapters, tau: ArrayLike) -> list[Linear]:
     """The previous layers seen through the adapters, P' W P''^T and P' b (Eq. 10)."""
     adapted = []
     for index, layer in enumerate(previous):
-        kernel, bias = permute_outputs(layer, adapters.out[index], tau)
+        weight, bias = permute_outputs(layer, adapters.out[index], tau)
         if index > 0:
-            kernel = permute(kernel.T, adapters.inp[index - 1], tau).T
-        adapted.append(Linear(kernel, bias))
+            weight = permute(weight, adapters.inp[index - 1], tau)
+        adapted.append(Linear(weight, bias))
     return adapted
 
 
