@@ -74,8 +74,9 @@ def _rows_forward(arrays, scores, tau):
 def _rows_backward(residuals, gradients):
     permuted, order, scores, tau = residuals
     n = order.shape[0]
+    # Contracted as they lie: a transposed operand would be copied under vmap.
     outer = sum(
-        g.reshape(n, -1) @ x.reshape(n, -1).T
+        jnp.einsum("ik,jk->ij", g.reshape(n, -1), x.reshape(n, -1))
         for g, x in zip(gradients, permuted, strict=True)
     )
     inverse = _invert(order)
