@@ -239,11 +239,13 @@ def run(bench: Bench) -> dict[str, Any]:
         "options": vars(methods["rewire"].options),
         "loops": figures,
     }
-    print(table(result))
+    shown = table(result)
+    print(shown)
     device = jax.devices()[0].device_kind.lower().replace(" ", "-")
     out = bench.out or Path("experiments/results") / f"speed-{device}.json"
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(result, indent=2) + "\n")
+    out.with_suffix(".md").write_text(f"```text\n{shown}\n```\n")
     print(out)
     return result
 

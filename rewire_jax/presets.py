@@ -79,13 +79,13 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     )
     if profile == "paper":
         return paper
-    interactions = min(25_600, scenario.interactions)
+    interactions = min(38_400, scenario.interactions)
     return dataclasses.replace(
         paper,
         tasks=period,
         interactions=interactions,
-        envs=64,
-        updates=32,
+        envs=32,
+        updates=16,
         warmup=min(2_560, interactions // 4),
         eval_episodes=4,
         selection_episodes=4 * period,

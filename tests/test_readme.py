@@ -54,7 +54,7 @@ def test_the_readmes_own_scenario_and_method_work(tmp_path: Path) -> None:
     # All but the training, which takes minutes.
     exec(own.split("train(dataclasses")[0], names)
     assert list(names["scenario"].tasks[1].action_scale).count(0) == 1
-    assert names["settings"].interactions == 25_600
+    assert names["settings"].interactions == 38_400
     blocks = re.findall(
         r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
     )
