@@ -72,15 +72,21 @@ class Run:
         program, members, stage = self.plan.program, self.plan.members, now.stage
         state = program.begin(members, now.learner, now.alive, stage, task)
         now = now._replace(learner=None, state=state)
-        return self.select(now, state.learner, task, 0)
+        before, selection = self.select(now, state.learner, task, 0)
+        return now._replace(before=before, selection=selection)
 
     def select(
         self, now: Standing, learner: Learner, task: Task, phase: int
-    ) -> Standing:
-        """Rolls out the method's candidates, and counts the interactions."""
+    ) -> tuple[jax.Array | None, jax.Array]:
+        """Rolls out the candidates at the start (phase 0) or end (1) of a task.
+
+        Returns:
+          Their mean returns `[members, candidates]`, None where nothing is to be
+          chosen, and the interactions spent on candidates so far, `[members]`.
+        """
         program, settings = self.plan.program, self.plan.settings
         if program.candidates is None or not settings.selection_episodes:
-            return now
+            return None, now.selection
         candidates = program.candidates(self.plan.members, learner, now.stage)
         number = candidates.valid.shape[1]
         # They take turns in as many rows as an evaluation has tasks, so that both can
@@ -95,10 +101,8 @@ class Run:
             max(settings.selection_episodes // rows, 1),
         )
         used = jnp.sum(result.lengths, axis=2) * candidates.valid[:, turn]
-        return now._replace(
-            before=jnp.mean(result.returns, axis=2) @ share,
-            selection=now.selection + jnp.sum(used, axis=1),
-        )
+        returns = jnp.mean(result.returns, axis=2) @ share
+        return returns, now.selection + jnp.sum(used, axis=1)
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""
@@ -200,15 +204,19 @@ class Run:
         program, members, stage = self.plan.program, self.plan.members, now.stage
         assert now.state is not None
         learner = now.state.learner
-        before = now.before
-        # Drop the buffer before the environments of the evaluation are made.
-        now = now._replace(state=None)
-        now = self.select(now, learner, task, 1)
-        selection = None
-        if before is not None and now.before is not None:
-            selection = Selection(before, now.before)
-        learner = program.finish(members, learner, stage, selection)
-        now = now._replace(stage=stage + 1, steps=0, learner=learner, before=None)
+        after, spent = self.select(now, learner, task, 1)
+        chosen_by = None
+        if now.before is not None and after is not None:
+            chosen_by = Selection(now.before, after)
+        now = Standing(
+            stage=stage + 1,
+            steps=0,
+            learner=program.finish(members, learner, stage, chosen_by),
+            state=None,
+            before=None,
+            alive=now.alive,
+            selection=spent,
+        )
         returns = self.evaluate(now, stage)
         return now, [_finite(float(r)) for r in returns[:, stage]]
 
