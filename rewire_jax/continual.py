@@ -55,8 +55,9 @@ class Run:
         task = jax.tree.map(lambda leaf: leaf[stage], plan.tasks)
         if now.state is None:
             now = self.begin(now, task)
-        while now.steps < self.plan.steps:
-            now = self.chunk(now, task)
+        while now.steps < plan.steps + plan.polishing:
+            polishing = now.steps >= plan.steps
+            now = self.polish(now) if polishing else self.chunk(now, task)
             if self.stopping:
                 standing.save(self.folder, now)
                 raise Stopped(
@@ -72,6 +73,8 @@ class Run:
         program, members, stage = self.plan.program, self.plan.members, now.stage
         state = program.begin(members, now.learner, now.alive, stage, task)
         now = now._replace(learner=None, state=state)
+        if not program.baseline:
+            return now
         before, selection = self.select(now, state.learner, task, 0)
         return now._replace(before=before, selection=selection)
 
@@ -84,21 +87,19 @@ class Run:
           Their mean returns `[members, candidates]`, None where nothing is to be
           chosen, and the interactions spent on candidates so far, `[members]`.
         """
-        program, settings = self.plan.program, self.plan.settings
-        if program.candidates is None or not settings.selection_episodes:
+        program, rows = self.plan.program, self.plan.rows
+        if program.candidates is None or not rows:
             return None, now.selection
         candidates = program.candidates(self.plan.members, learner, now.stage)
         number = candidates.valid.shape[1]
-        # They take turns in as many rows as an evaluation has tasks, so that both can
-        # be one compiled function.
-        rows = max(number, settings.tasks)
+        # They take turns where there are more rows than candidates.
         turn = jnp.arange(rows) % number
         share = jax.nn.one_hot(turn, number) / jnp.bincount(turn, length=number)
         result = program.rollout(
             jax.tree.map(lambda leaf: jnp.stack([leaf] * rows), task),
             jax.tree.map(lambda leaf: leaf[:, turn], candidates.policies),
             self.keys(_SELECTION, 2 * now.stage + phase, rows),
-            max(settings.selection_episodes // rows, 1),
+            self.plan.episodes,
         )
         used = jnp.sum(result.lengths, axis=2) * candidates.valid[:, turn]
         returns = jnp.mean(result.returns, axis=2) @ share
@@ -116,33 +117,75 @@ class Run:
     def chunk(self, now: Standing, task: Task) -> Standing:
         """Trains until the next progress report."""
         began = clock.perf_counter()
-        plan, settings = self.plan, self.plan.settings
-        stage, done = now.stage, now.steps
-        every = max(settings.report_every // settings.envs, 1)
-        steps = min(every - done % every, self.plan.steps - done)
-        compiled = plan.program.chunk._cache_size()  # type: ignore[attr-defined]
-        state, report = plan.program.chunk(
-            plan.members, now.state, stage, task, done, steps
-        )
+        program, members, stage = self.plan.program, self.plan.members, now.stage
+        done, steps = now.steps, self.due(now.steps, self.plan.steps)
+        compiled = program.chunk._cache_size()  # type: ignore[attr-defined]
+        state, report = program.chunk(members, now.state, stage, task, done, steps)
         report = jax.tree.map(np.asarray, report)
-        alive = np.array(state.alive)
-        lost = now.alive & ~alive
-        for seed, is_lost in zip(plan.seeds, lost, strict=True):
-            if is_lost:
-                self.progress.message(
-                    f"seed {seed}: a value is not finite in task {stage}; its learner "
-                    "stays as it was, try lower learning rates"
-                )
-        done += steps
-        now = now._replace(steps=done, state=state, alive=alive)
         seconds = clock.perf_counter() - began
-        compiles = plan.program.chunk._cache_size() > compiled  # type: ignore
+        compiles = program.chunk._cache_size() > compiled  # type: ignore[attr-defined]
+        now = self.advance(now, state, steps)
         self.log(now, report, seconds, compiles, steps)
-        interval = settings.checkpoint_every // settings.envs // every * every
-        due = settings.checkpoint_every and done % max(interval, every) == 0
-        if due and done < self.plan.steps:
-            standing.save(self.folder, now)
+        if now.steps == self.plan.steps and program.consolidate:
+            learner = program.consolidate(members, state, stage, now.steps)
+            now = now._replace(state=state._replace(learner=learner))
+        self.save(now, done)
         return now
+
+    def polish(self, now: Standing) -> Standing:
+        """Updates from the buffer until the next progress report."""
+        began = clock.perf_counter()
+        plan, stage = self.plan, now.stage
+        before = now.steps
+        steps = self.due(before, plan.steps + plan.polishing)
+        compiled = plan.program.polish._cache_size()  # type: ignore[attr-defined]
+        state, report = plan.program.polish(
+            plan.members, now.state, stage, plan.steps, before - plan.steps, steps
+        )
+        jax.block_until_ready(report)
+        now = self.advance(now, state, steps)
+        timing = {
+            "stage": stage,
+            "interactions": plan.interactions,
+            "polishing": now.steps - plan.steps,
+            "seconds": clock.perf_counter() - began,
+            "compile": plan.program.polish._cache_size() > compiled,  # type: ignore
+        }
+        runfolder.append(self.folder, "timing.jsonl", [timing])
+        share = (now.steps - plan.steps) / plan.polishing
+        self.progress.update(
+            stage,
+            plan.interactions,
+            [None] * len(plan.seeds),
+            rate=None,
+            note=f"updates without interactions: {share:.0%}",
+        )
+        self.save(now, before)
+        return now
+
+    def due(self, done: int, end: int) -> int:
+        """Steps until the next progress report, or until the end."""
+        every = max(self.plan.settings.report_every // self.plan.settings.envs, 1)
+        return min(every - done % every, end - done)
+
+    def advance(self, now: Standing, state: training.State, steps: int) -> Standing:
+        """The run after these steps; tells of members that were frozen in them."""
+        alive = np.array(state.alive)
+        for seed, lost in zip(self.plan.seeds, now.alive & ~alive, strict=True):
+            if lost:
+                self.progress.message(
+                    f"seed {seed}: a value is not finite in task {now.stage}; its "
+                    "learner stays as it was, try lower learning rates"
+                )
+        return now._replace(steps=now.steps + steps, state=state, alive=alive)
+
+    def save(self, now: Standing, before: int) -> None:
+        """Writes a checkpoint from within a task if one is due after `before`."""
+        settings = self.plan.settings
+        interval = max(settings.checkpoint_every // settings.envs, 1)
+        due = settings.checkpoint_every and now.steps // interval > before // interval
+        if due and now.steps < self.plan.steps + self.plan.polishing:
+            standing.save(self.folder, now)
 
     def log(
         self,
@@ -187,8 +230,7 @@ class Run:
         for row in rows:
             self.events.training(row, settings.interactions)
         rate = steps * settings.envs * len(rows) / seconds
-        total = settings.interactions * settings.tasks
-        left = total - stage * settings.interactions - interactions
+        left = plan.interactions * (settings.tasks - stage) - interactions
         self.progress.update(
             stage,
             interactions,
@@ -238,7 +280,7 @@ class Run:
                 "return": _finite(float(returns[member, index])),
                 "episodes": settings.eval_episodes,
                 "interactions": {
-                    "training": (stage + 1) * self.plan.steps * settings.envs,
+                    "training": (stage + 1) * plan.interactions,
                     "selection": int(now.selection[member]),
                 },
                 "diverged": not bool(now.alive[member]),
@@ -322,7 +364,7 @@ def train(
     label = f"{settings.method} on {settings.scenario}"
     with ExitStack() as stack:
         display = stack.enter_context(
-            progress(plan.names, plan.settings.interactions, plan.seeds, label)
+            progress(plan.names, plan.interactions, plan.seeds, label)
         )
         events = stack.enter_context(Events(folder, plan.seeds, tensorboard))
         run = Run(plan, folder, events, display)

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax import config, networks, population, training
+from rewire_jax import config, networks, population, program, training
 from rewire_jax.config import Settings, require
 from rewire_jax.envs.base import Task
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec, count
 from rewire_jax.population import Members
+from rewire_jax.program import Program
 from rewire_jax.scenarios import Scenario, make_scenario
-from rewire_jax.training import Program
 
 
 class Plan(NamedTuple):
@@ -26,6 +26,10 @@ class Plan(NamedTuple):
       names: of these tasks.
       seeds: of the members.
       steps: steps of all environments in a task.
+      polishing: after these, steps that only update from the buffer.
+      rows: candidates rolled out side by side, each perhaps several times; 0 where
+        nothing is to be chosen.
+      episodes: in each row.
       spec: sizes of the networks and of the sequence.
       members: what tells the members apart.
       program: the compiled functions.
@@ -37,15 +41,24 @@ class Plan(NamedTuple):
     names: tuple[str, ...]
     seeds: tuple[int, ...]
     steps: int
+    polishing: int
+    rows: int
+    episodes: int
     spec: Spec
     members: Members
     program: Program
 
+    @property
+    def interactions(self) -> int:
+        """Of training, in a task."""
+        return self.steps * self.settings.envs
+
 
 def base_size(spec: Spec) -> int:
     """Numbers in one plain policy, by which model sizes are divided."""
-    sizes = [spec.observations, *[spec.hidden] * spec.depth, 2 * spec.actions]
-    return count(jax.eval_shape(lambda: networks.init_mlp(jax.random.key(0), sizes)))
+    return count(
+        jax.eval_shape(lambda: networks.init_mlp(jax.random.key(0), spec.sizes()))
+    )
 
 
 def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
@@ -79,14 +92,43 @@ def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
     )
     seeds = tuple(range(settings.seed, settings.seed + settings.seeds))
     sequence = scenario.tasks[: settings.tasks]
+    members = population.members([(settings.sac, settings.options)], seeds)
+    built = program.build(environment, entry.make, spec, shape, settings.options)
+    method = entry.make(spec, settings.options)
+    rows, episodes = _selection(settings, built, members)
+    budget = settings.interactions
+    if method.in_budget:
+        budget -= rows * episodes * environment.episode_length
+        require(
+            budget >= settings.warmup + settings.envs,
+            f"--interactions {settings.interactions} must also pay for "
+            f"{rows * episodes} episodes of choosing between policies: raise it, or "
+            "lower --selection-episodes or --warmup",
+        )
     return Plan(
         settings=settings,
         scenario=scenario,
         tasks=jax.tree.map(lambda *x: jnp.stack(x), *[t.data for t in sequence]),
         names=tuple(task.name for task in sequence),
         seeds=seeds,
-        steps=settings.interactions // settings.envs,
+        steps=budget // settings.envs,
+        polishing=-(-int(method.offline * settings.interactions) // settings.updates),
+        rows=rows,
+        episodes=episodes,
         spec=spec,
-        members=population.members([(settings.sac, settings.options)], seeds),
-        program=training.build(environment, entry.make, spec, shape, settings.options),
+        members=members,
+        program=built,
     )
+
+
+def _selection(settings: Settings, built: Program, members: Members) -> tuple[int, int]:
+    """Rows of a selection, and the episodes in each."""
+    if built.candidates is None or not settings.selection_episodes:
+        return 0, 0
+    learner = jax.eval_shape(built.init, members)
+    number = jax.eval_shape(built.candidates, members, learner, 0).valid.shape[1]
+    # In as many rows as an evaluation has tasks, both can be one compiled function.
+    rows = max(number, settings.tasks)
+    if rows > settings.selection_episodes:
+        rows = number
+    return rows, max(settings.selection_episodes // rows, 1)

@@ -65,6 +65,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         for p in range(1, len(order) + 1)
         if all(task == order[i % p] for i, task in enumerate(order))
     )
+    entry = find_method(method)
     paper = Settings(
         scenario=scenario.name,
         method=method,
@@ -75,7 +76,8 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         paper_interactions=scenario.interactions,
         warmup=min(12_800, scenario.interactions // 4),
         sac=_sac(scenario.name),
-        options=find_method(method).preset(scenario.name, period, profile),
+        options=entry.preset(scenario.name, period, profile),
+        selection_episodes=entry.selection_episodes or 128,
     )
     if profile == "paper":
         return paper
@@ -88,7 +90,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         updates=16,
         warmup=min(2_560, interactions // 4),
         eval_episodes=4,
-        selection_episodes=4 * period,
+        selection_episodes=entry.selection_episodes or 4 * period,
         report_every=2_560,
         checkpoint_every=12_800,
         # A temperature that falls from 2 at the paper's rate would keep the policy

@@ -75,7 +75,7 @@ class Progress:
         stage: int,
         interactions: int,
         returns: Sequence[float | None],
-        rate: float,
+        rate: float | None,
         seconds_left: float | None = None,
         note: str | None = None,
     ) -> None:
@@ -85,7 +85,7 @@ class Progress:
             stage: index of the task in training.
             interactions: made in this task, for each seed.
             returns: latest training return of each seed, None where there is none yet.
-            rate: interactions/s of all seeds together.
+            rate: interactions/s of all seeds together, None where there are none.
             seconds_left: of the whole run, None where it cannot be told yet.
             note: anything else, such as "evaluating".
         """
@@ -97,7 +97,7 @@ class Progress:
             ProgressBar(self._total, interactions, width=24),
             Text(f"{interactions:,} / {self._total:,} interactions"),
         )
-        speed = [f"{rate:,.0f} interactions/s"]
+        speed = [] if rate is None else [f"{rate:,.0f} interactions/s"]
         if seconds_left is not None:
             speed.append(f"{_clock(seconds_left)} left")
         if note:

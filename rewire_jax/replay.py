@@ -1,6 +1,6 @@
 """A ring buffer of transitions that stores each observation once."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ class Replay(NamedTuple):
       terminal: `[rows, envs]` bool, ended by the task.
       truncated: `[rows, envs]` bool, ended by the time limit.
       final: `[cuts, envs, observations]`.
+      label: pytree of `[rows, envs, ...]`, what a method stores beside.
     """
 
     observation: jax.Array
@@ -33,6 +34,7 @@ class Replay(NamedTuple):
     terminal: jax.Array
     truncated: jax.Array
     final: jax.Array
+    label: Any = ()
 
 
 class Batch(NamedTuple):
@@ -44,10 +46,16 @@ class Batch(NamedTuple):
     terminal: jax.Array
     truncated: jax.Array
     next_observation: jax.Array
+    label: Any = ()
 
 
 def create(
-    first: jax.Array, *, transitions: int, actions: int, episode_length: int
+    first: jax.Array,
+    *,
+    transitions: int,
+    actions: int,
+    episode_length: int,
+    label: Any = (),
 ) -> Replay:
     """An empty buffer.
 
@@ -57,6 +65,7 @@ def create(
         observation after the last.
       actions: length of an action.
       episode_length: steps to a time limit.
+      label: pytree of `[envs, ...]`, an example of what is stored beside.
     """
     envs, size = first.shape
     rows = transitions + 1
@@ -68,6 +77,7 @@ def create(
         terminal=jnp.zeros((rows, envs), bool),
         truncated=jnp.zeros((rows, envs), bool),
         final=jnp.zeros((cuts, envs, size), first.dtype),
+        label=jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), label),
     )
 
 
@@ -82,6 +92,7 @@ def add(
     last: jax.Array,
     following: jax.Array,
     episode_length: int,
+    label: Any = (),
 ) -> Replay:
     """Stores the transitions of one time step.
 
@@ -96,6 +107,7 @@ def add(
       following: `[envs, observations]`, the same but for ended episodes, where it
         is the first observation of the next one.
       episode_length: as in `create`.
+      label: as in `create`.
     """
     rows, cuts = replay.reward.shape[0], replay.final.shape[0]
 
@@ -111,6 +123,7 @@ def add(
         terminal=put(replay.terminal, row, terminal),
         truncated=put(replay.truncated, row, truncated),
         final=put(replay.final, cut, jnp.where(truncated[:, None], last, kept)),
+        label=jax.tree.map(lambda a, v: put(a, row, v), replay.label, label),
     )
 
 
@@ -144,4 +157,5 @@ def sample(
             replay.final[cut, env],
             replay.observation[(row + 1) % rows, env],
         ),
+        label=jax.tree.map(lambda a: a[row, env], replay.label),
     )

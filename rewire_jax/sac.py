@@ -39,20 +39,24 @@ def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> Learne
     """A learner before its first task."""
     policy_key, critic_key = jax.random.split(key)
     params, memory = method.init(policy_key)
-    sizes = [spec.observations + spec.actions, *[spec.hidden] * spec.depth, 1]
-    critic = jax.vmap(lambda k: networks.init_mlp(k, sizes))(
-        jax.random.split(critic_key)
-    )
+    critic = init_critic(critic_key, spec, method.extra)
     return restart(
         Learner(params, memory, critic, critic, jnp.zeros(()), ((), (), ())), sac
     )
 
 
+def init_critic(key: jax.Array, spec: Spec, extra: int) -> Any:
+    """Both critics, which see `extra` numbers beside observation and action."""
+    inputs = spec.observations + extra + spec.actions
+    sizes = [inputs, *[spec.hidden] * spec.depth, 1]
+    return jax.vmap(lambda k: networks.init_mlp(k, sizes))(jax.random.split(key))
+
+
 def restart(learner: Learner, sac: SacSettings) -> Learner:
-    """Fresh optimisers and temperature, as at the start of every task."""
+    """Fresh optimisers, temperature and targets, as at the start of every task."""
     log_temperature = jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32))
     return learner._replace(
-        # The targets start each task as copies of the critics that are kept.
+        # The targets start as copies of the critics that are kept.
         target=learner.critic,
         log_temperature=log_temperature,
         optimizers=(
@@ -63,27 +67,35 @@ def restart(learner: Learner, sac: SacSettings) -> Learner:
     )
 
 
-def q_values(critic: Any, observation: jax.Array, action: jax.Array) -> jax.Array:
-    """Both critics' values `[2, batch]` of `[batch, ...]` observations, actions."""
-    inputs = jnp.concatenate([observation, action], axis=-1)
+def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
+    """Both critics' values `[2, batch]`.
+
+    Args:
+      critic: layers of both.
+      inputs: `[batch, observations + extra]`, see `Method.critic_input`.
+      action: `[batch, actions]`.
+    """
+    inputs = jnp.concatenate([inputs, action], axis=-1)
     return jax.vmap(networks.mlp, (0, None))(critic, inputs)[..., 0]
 
 
 def _critic_loss(critic, learner, batch, key, method, sac):
     context_key, action_key = jax.random.split(key)
-    context = method.context(context_key, learner.memory, True)
+    context = method.context(context_key, learner.memory, "critic", batch.label)
     mean, log_std = method.distribution(
         learner.params, learner.memory, context, batch.next_observation
     )
     action, log_density = networks.sample_action(action_key, mean, log_std)
-    q_next = jnp.min(q_values(learner.target, batch.next_observation, action), axis=0)
+    following = method.critic_input(context, batch.next_observation)
+    q_next = jnp.min(q_values(learner.target, following, action), axis=0)
     soft_value = q_next - jnp.exp(learner.log_temperature) * log_density
     ended = batch.terminal
     if sac.time_limit == "terminal":
         ended = ended | batch.truncated
     target = sac.reward_scale * batch.reward
     target += sac.discount * jnp.where(ended, 0.0, soft_value)
-    q = q_values(critic, batch.observation, batch.action)
+    inputs = method.critic_input(context, batch.observation)
+    q = q_values(critic, inputs, batch.action)
     error = q - jax.lax.stop_gradient(target)
     return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
 
@@ -91,10 +103,11 @@ def _critic_loss(critic, learner, batch, key, method, sac):
 def _policy_loss(params, learner, batch, key, method):
     context_key, action_key, penalty_key = jax.random.split(key, 3)
     memory = learner.memory
-    context = method.context(context_key, memory, True)
+    context = method.context(context_key, memory, "policy", batch.label)
     gaussian = method.distribution(params, memory, context, batch.observation)
     action, log_density = networks.sample_action(action_key, *gaussian)
-    q = jnp.min(q_values(learner.critic, batch.observation, action), axis=0)
+    inputs = method.critic_input(context, batch.observation)
+    q = jnp.min(q_values(learner.critic, inputs, action), axis=0)
     entropy = -jnp.mean(log_density)
     loss = -jnp.exp(learner.log_temperature) * entropy - jnp.mean(q)
     penalty, metrics = method.penalty(

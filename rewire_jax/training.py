@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from rewire_jax import networks, replay, rollout, sac
 from rewire_jax.config import SacSettings
 from rewire_jax.envs.base import Environment, Task
-from rewire_jax.methods.base import Candidates, Method, Selection, Spec
+from rewire_jax.methods.base import Method
 
 
 class Shape(NamedTuple):
@@ -37,10 +37,12 @@ class Collection(NamedTuple):
     Attributes:
       buffer: the replay buffer.
       episodes: `[envs]` environments.
+      label: the method's, of the latest step.
     """
 
     buffer: replay.Replay
     episodes: rollout.Episode
+    label: Any
 
 
 class State(NamedTuple):
@@ -75,33 +77,6 @@ class Report(NamedTuple):
     metrics: sac.Metrics
 
 
-class Program(NamedTuple):
-    """The compiled functions of a run; the first axis of all is `[members]`.
-
-    A function is traced once, whatever the task: tasks and times are data.
-
-    Attributes:
-      init: `members -> Learner`.
-      begin: `(members, learner, alive, index, task) -> State`, a task's start.
-      chunk: `(members, state, index, task, time, steps) -> state, Report`, takes
-        `steps` steps of all environments; the given state is used up.
-      candidates: `(members, learner, index) -> Candidates`, or None.
-      finish: `(members, learner, index, Selection or None) -> Learner`.
-      policies: `(members, learner) -> policies [members, tasks]`.
-      rollout: `(tasks, policies, keys, count) -> Rollout`, see `rollout.episodes`.
-      size: `(members, learner) -> [members]`, numbers stored.
-    """
-
-    init: Callable[..., sac.Learner]
-    begin: Callable[..., State]
-    chunk: Callable[..., tuple[State, Report]]
-    candidates: Callable[..., Candidates] | None
-    finish: Callable[..., sac.Learner]
-    policies: Callable[..., Any]
-    rollout: Callable[..., rollout.Rollout]
-    size: Callable[..., jax.Array]
-
-
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
     """`yes` where the scalar condition holds, else `no`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
@@ -124,9 +99,10 @@ def collect(
     shape: Shape,
 ) -> tuple[Collection, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
-    learner, (buffer, episodes), _ = state
-    context_key, action_key, random_key = jax.random.split(key, 3)
-    context = method.context(context_key, learner.memory, False)
+    learner, (buffer, episodes, label), _ = state
+    context_key, action_key, random_key, label_key = jax.random.split(key, 4)
+    label = method.label(label_key, learner.memory, label, episodes.steps)
+    context = method.context(context_key, learner.memory, "act", label)
     mean, log_std = method.distribution(
         learner.params, learner.memory, context, episodes.state.observation
     )
@@ -146,8 +122,60 @@ def collect(
         last=step.last,
         following=step.following,
         episode_length=environment.episode_length,
+        label=label,
     )
-    return Collection(buffer, episodes), step
+    return Collection(buffer, episodes, label), step
+
+
+def learn(
+    key: jax.Array,
+    state: State,
+    time: jax.Array,
+    first: jax.Array,
+    updates: jax.Array | int,
+    *,
+    environment: Environment,
+    method: Method,
+    settings: SacSettings,
+) -> tuple[State, sac.Metrics]:
+    """Updates from a member's buffer, and the last one's metrics.
+
+    Args:
+      key: a random key.
+      state: the member.
+      time: `[]` int, steps of all environments in the buffer.
+      first: `[]` int, updates made before; shared by all members.
+      updates: how many.
+      environment: unbatched.
+      method: the method.
+      settings: SAC's.
+    """
+
+    def draw(key):
+        buffer, length = state.collection.buffer, environment.episode_length
+        return replay.sample(buffer, key, time, settings.batch_size, length)
+
+    def one(number, carry):
+        learner, metrics = carry
+        sample_key, update_key = jax.random.split(jax.random.fold_in(key, number))
+        return sac.update(
+            learner,
+            metrics,
+            draw(sample_key),
+            update_key,
+            first + number,
+            method,
+            settings,
+        )
+
+    zeros = sac.policy_metrics(state.learner, draw(key), method, settings)
+    zeros |= {"critic_loss": jnp.zeros(()), "q": jnp.zeros(())}
+    learner, metrics = jax.lax.fori_loop(0, updates, one, (state.learner, zeros))
+    alive = state.alive & all_finite(
+        (learner.params, learner.critic, learner.log_temperature)
+    )
+    learner = select(alive, learner, state.learner)
+    return state._replace(learner=learner, alive=alive), metrics
 
 
 def train(
@@ -176,11 +204,9 @@ def train(
       settings: SAC's.
       shape: static sizes.
     """
-
-    def draw(key, buffer, time):
-        return replay.sample(
-            buffer, key, time, settings.batch_size, environment.episode_length
-        )
+    update = functools.partial(
+        learn, environment=environment, method=method, settings=settings
+    )
 
     def step(index, carry):
         state, report = carry
@@ -188,20 +214,10 @@ def train(
         collection, stepped = collect(
             collect_key, state, task, index, environment, method, shape
         )
+        state = state._replace(collection=collection)
         updates = jnp.where(index >= shape.warmup, shape.updates, 0)
-
-        def one(number, carry):
-            learner, metrics = carry
-            sample_key, key = jax.random.split(jax.random.fold_in(update_key, number))
-            batch = draw(sample_key, collection.buffer, index + 1)
-            count = (index - shape.warmup) * shape.updates + number
-            return sac.update(learner, metrics, batch, key, count, method, settings)
-
-        learner, metrics = jax.lax.fori_loop(0, updates, one, (state.learner, zeros))
-        alive = state.alive & all_finite(
-            (learner.params, learner.critic, learner.log_temperature)
-        )
-        learner = select(alive, learner, state.learner)
+        first = (index - shape.warmup) * shape.updates
+        state, metrics = update(update_key, state, index + 1, first, updates)
         ended = stepped.terminal | stepped.truncated
         report = Report(
             report.episodes + jnp.sum(ended),
@@ -210,124 +226,15 @@ def train(
             report.updates + (updates > 0),
             jax.tree.map(jnp.add, report.metrics, metrics),
         )
-        return State(learner, collection, alive), report
+        return state, report
 
-    batch = draw(key, state.collection.buffer, jnp.asarray(1))
-    zeros = sac.policy_metrics(state.learner, batch, method, settings)
-    zeros |= {"critic_loss": jnp.zeros(()), "q": jnp.zeros(())}
-    none = jnp.zeros(())
-    report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros)
+    report = empty_report(update, key, state)
     return jax.lax.fori_loop(time, time + steps, step, (state, report))
 
 
-@functools.lru_cache
-def rollout_function(
-    environment: Environment, act: Callable[..., Any], rows: int, count: int
-) -> Callable[..., rollout.Rollout]:
-    """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
-
-    Methods whose policies are computed alike share one compiled function.
-    """
-
-    def episodes(tasks: Task, policies: Any, keys: jax.Array) -> rollout.Rollout:
-        assert keys.shape[1] == rows
-        return rollout.episodes(environment, act, tasks, policies, keys, count)
-
-    return jax.jit(episodes)
-
-
-@functools.lru_cache
-def build(
-    environment: Environment,
-    make: Callable[[Spec, Any], Method],
-    spec: Spec,
-    shape: Shape,
-    example: Any,
-) -> Program:
-    """The functions of a run; runs alike in all but numbers share them.
-
-    Args:
-      environment: of the scenario.
-      make: the method's constructor.
-      spec: sizes of the networks and of the sequence.
-      shape: sizes of the loop.
-      example: one member's method settings, for what is static about the method.
-    """
-
-    def init(member):
-        key = jax.random.fold_in(member.keys, 0)
-        return sac.init(key, make(spec, member.options), spec, member.sac)
-
-    def task_keys(member, index):
-        # One for the start, one for the steps. A key is either split or folded,
-        # never both: `split(key)[i]` is the same key as `fold_in(key, i)`.
-        key = jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
-        return jax.random.split(key)
-
-    def begin(member, learner, alive, index, task):
-        method = make(spec, member.options)
-        start_key, reset_key = jax.random.split(task_keys(member, index)[0])
-        params, memory = method.start_task(
-            start_key, learner.params, learner.memory, index
-        )
-        learner = learner._replace(params=params, memory=memory)
-        keys = jax.random.split(reset_key, shape.envs)
-        episodes = jax.vmap(lambda k: rollout.begin(environment, task, k))(keys)
-        buffer = replay.create(
-            episodes.state.observation,
-            transitions=shape.transitions,
-            actions=spec.actions,
-            episode_length=environment.episode_length,
-        )
-        learner = sac.restart(learner, member.sac)
-        return State(learner, Collection(buffer, episodes), alive)
-
-    def chunk(member, state, index, task, time, steps):
-        return train(
-            task_keys(member, index)[1],
-            state,
-            task,
-            time,
-            steps,
-            environment=environment,
-            method=make(spec, member.options),
-            settings=member.sac,
-            shape=shape,
-        )
-
-    def candidates(member, learner, index):
-        method = make(spec, member.options)
-        assert method.candidates is not None
-        return method.candidates(learner.params, learner.memory, index)
-
-    def finish(member, learner, index, selection: Selection | None):
-        method = make(spec, member.options)
-        params, memory = method.end_task(
-            learner.params, learner.memory, index, selection
-        )
-        return learner._replace(params=params, memory=memory)
-
-    def policies(member, learner):
-        method = make(spec, member.options)
-        policy = functools.partial(method.policy, learner.params, learner.memory)
-        return jax.vmap(policy)(jnp.arange(spec.tasks))
-
-    def rollout_episodes(tasks, policies, keys, count):
-        function = rollout_function(environment, method.act, keys.shape[1], count)
-        return function(tasks, policies, keys)
-
-    def size(member, learner):
-        return make(spec, member.options).size(learner.params, learner.memory)
-
-    method = make(spec, example)
-    chunk_axes = (0, 0, None, None, None, None)
-    return Program(
-        init=jax.jit(jax.vmap(init)),
-        begin=jax.jit(jax.vmap(begin, (0, 0, 0, None, None))),
-        chunk=jax.jit(jax.vmap(chunk, chunk_axes), donate_argnums=1),
-        candidates=method.candidates and jax.jit(jax.vmap(candidates, (0, 0, None))),
-        finish=jax.jit(jax.vmap(finish, (0, 0, None, 0))),
-        policies=jax.jit(jax.vmap(policies)),
-        rollout=rollout_episodes,
-        size=jax.jit(jax.vmap(size)),
-    )
+def empty_report(update: Callable[..., Any], key: jax.Array, state: State) -> Report:
+    """A report of nothing, with a place for each metric that `update` gives."""
+    _, shapes = jax.eval_shape(update, key, state, 1, 0, 1)
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    none = jnp.zeros(())
+    return Report(jnp.zeros((), jnp.int32), none, none, none, zeros)

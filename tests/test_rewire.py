@@ -216,19 +216,19 @@ def test_updates_are_scaled_after_the_optimiser(rate, factor):
 # Contexts
 
 
-@functools.partial(jax.jit, static_argnames=("number", "learning"))
-def contexts(options, number, learning):
+@functools.partial(jax.jit, static_argnames=("number", "purpose"))
+def contexts(options, number, purpose):
     method = rewiring.rewire(SPEC, options)
     _, memory = method.init(KEY)
-    draw = jax.vmap(lambda key: method.context(key, memory, learning))
+    draw = jax.vmap(lambda key: method.context(key, memory, purpose, ()))
     return draw(jax.random.split(KEY, number))
 
 
-@pytest.mark.parametrize("learning", [False, True])
-def test_modes_are_uniform(learning):
+@pytest.mark.parametrize("purpose", ["act", "critic", "policy"])
+def test_modes_are_uniform(purpose):
     for modes in (1, 3, 4):
         options = RewireSettings(modes=modes, mode_slots=5)
-        drawn = contexts(options, number=4000, learning=learning)
+        drawn = contexts(options, number=4000, purpose=purpose)
         assert drawn.mode.shape == (4000,)  # one for all layers
         counts = np.bincount(drawn.mode, minlength=5)
         np.testing.assert_array_equal(counts[modes:], 0)
@@ -238,9 +238,9 @@ def test_modes_are_uniform(learning):
 
 def test_noise_is_gumbel_and_only_in_learning():
     loud, quiet = (RewireSettings(mode_slots=5, noise=noise) for noise in (0.3, 0.0))
-    assert np.all(np.asarray(contexts(loud, number=4000, learning=False).noise) == 0)
-    assert np.all(np.asarray(contexts(quiet, number=4000, learning=True).noise) == 0)
-    noise = np.float64(contexts(loud, number=4000, learning=True).noise)
+    assert np.all(np.asarray(contexts(loud, number=4000, purpose="act").noise) == 0)
+    assert np.all(np.asarray(contexts(quiet, number=4000, purpose="policy").noise) == 0)
+    noise = np.float64(contexts(loud, number=4000, purpose="policy").noise)
     assert noise.shape == (4000, DEPTH, N)
     # Its distribution function is exp(-exp(-x)).
     uniform = np.sort(np.exp(-np.exp(-noise.ravel() / 0.3)))
@@ -688,7 +688,7 @@ def live(params, memory, shift, result, modes):
         scores=params.scores + shift,
         hidden=jax.tree.map(lambda x: 1.1 * x, params.hidden),
     )
-    context = method.context(KEY, memory, True)
+    context = method.context(KEY, memory, "policy", ())
 
     def loss(params):
         gaussian = method.distribution(params, memory, context, OBSERVATION)

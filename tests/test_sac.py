@@ -328,7 +328,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
                 actions=1,
                 episode_length=environment.episode_length,
             )
-            collection = training.Collection(buffer, episodes)
+            collection = training.Collection(buffer, episodes, ())
             return training.State(learner, collection, jnp.asarray(True))
 
         def train(key, state, task):

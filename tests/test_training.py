@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from rewire_jax import population, training
+from rewire_jax import program as compiled
 from rewire_jax.config import SacSettings
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Selection, Spec
@@ -56,7 +57,7 @@ def configurations(method):
 
 def build(method):
     make = find_method(method).make
-    return training.build(SCENARIO.environment, make, SPEC, SHAPE, options(method, 0))
+    return compiled.build(SCENARIO.environment, make, SPEC, SHAPE, options(method, 0))
 
 
 def crowd(method="ft1"):

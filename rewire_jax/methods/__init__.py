@@ -18,11 +18,14 @@ class Entry(NamedTuple):
         settings ready to use or raises `UserError`.
       preset: `(scenario name, period, profile) -> settings`; tasks recur after
         `period` places.
+      selection_episodes: what its candidates are played by default, in all; None for
+        the profile's number.
     """
 
     make: Callable[[Spec, Any], Method]
     settings: type
     preset: Callable[[str, int, str], Any]
+    selection_episodes: int | None = None
 
 
 METHODS: dict[str, Entry] = {

@@ -1,18 +1,25 @@
 """What a continual-learning method is: a record of pure functions."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
+
+from rewire_jax.replay import Batch
 
 Params = Any
 """Pytree that the policy's optimiser trains."""
 Memory = Any
 """Pytree that a method carries from task to task, with its slots from the start."""
+Label = Any
+"""Pytree that a method stores with each transition."""
 Context = Any
 """Pytree of what a method draws for one update or one acting step."""
 Policy = Any
 """Pytree from which `Method.act` computes actions."""
+Purpose = Literal["act", "critic", "policy"]
+"""What a context is drawn for: a step, the critics' update, the policy's."""
 
 
 class Spec(NamedTuple):
@@ -32,6 +39,24 @@ class Spec(NamedTuple):
     depth: int
     tasks: int
 
+    def sizes(self, width: int = 0) -> list[int]:
+        """Layer sizes of a plain policy; `width` 0 stands for `hidden`."""
+        hidden = [width or self.hidden] * self.depth
+        return [self.observations, *hidden, 2 * self.actions]
+
+
+class Tools(NamedTuple):
+    """What a method may use at the end of a task's interactions.
+
+    Attributes:
+      sample: `(key, count) -> Batch`, `[count]` transitions of the task.
+      q: `(context, observation, action) -> [2, count]`, both critics' values of
+        `[count, ...]` observations and actions.
+    """
+
+    sample: Callable[[jax.Array, int], Batch]
+    q: Callable[[Context, jax.Array, jax.Array], jax.Array]
+
 
 class Candidates(NamedTuple):
     """Policies that a method wants rolled out on the current task.
@@ -49,11 +74,11 @@ class Selection(NamedTuple):
     """Mean returns of a method's candidates on the task just trained.
 
     Attributes:
-      before: `[candidates]`, when the task began.
+      before: `[candidates]`, when the task began; None without `Method.baseline`.
       after: `[candidates]`, at its end.
     """
 
-    before: jax.Array
+    before: jax.Array | None
     after: jax.Array
 
 
@@ -62,44 +87,89 @@ class Method(NamedTuple):
 
     It is made by `make(spec, settings)` inside traced code, so that the settings'
     numbers may differ between the members of a population. `task` is a `[]` int,
-    the index in the sequence.
+    the index in the sequence. Only the first five are needed.
 
     Attributes:
       init: `key -> params, memory`, before the first task.
-      start_task: `(key, params, memory, task) -> params, memory`. Optimisers and
-        temperature start anew by themselves.
-      context: `(key, memory, learning) -> context`, drawn for each update
-        (`learning`, a Python bool) and each acting step.
       distribution: `(params, memory, context, observation) -> mean, log_std` of
         the Gaussian before the squashing; observation `[..., observations]`.
-      penalty: `(key, params, memory, context, observation, (mean, log_std)) ->
-        loss, metrics`, added to SAC's policy loss; the pair is what
-        `distribution` gave for the same arguments.
-      adjust_updates: `(updates, memory) -> updates`, after the optimiser.
-      candidates: `(params, memory, task) -> Candidates`, rolled out at the start
-        and at the end of each task, or None where nothing is to be chosen.
-      end_task: `(params, memory, task, Selection or None) -> params, memory`.
       policy: `(params, memory, task) -> policy` for a task of the sequence, after
         any number of finished tasks; one not yet seen gets the latest policy, or
         the one that the method knows to belong to it.
       act: `(policy, observation) -> mean, log_std`; a plain function, the same
         object for all members.
       size: `(params, memory) -> []`, the numbers stored for all policies.
+      start_task: `(key, params, memory, task) -> params, memory`. Optimisers and
+        temperature start anew by themselves.
+      label: `(key, memory, label, steps) -> label [envs, ...]`, stored with the
+        transitions of a step. `steps` `[envs]` counts those of the running
+        episodes; `label` is that of the step before, None in a task's first.
+      context: `(key, memory, purpose, label) -> context`, drawn for each update
+        and each acting step; `label` `[batch, ...]` is that of the transitions.
+      penalty: `(key, params, memory, context, observation, (mean, log_std)) ->
+        loss, metrics`, added to SAC's policy loss; the pair is what
+        `distribution` gave for the same arguments.
+      adjust_updates: `(updates, memory) -> updates`, after the optimiser.
+      critic_input: `(context, observation) -> [..., observations + extra]`, what
+        the critics see beside the action.
+      extra: numbers in it beyond the observation.
+      fresh_critic: whether the critics, too, start anew with each task.
+      consolidate: `(key, params, memory, task, tools) -> params, memory`, when a
+        task's interactions are over; or None.
+      offline: updates from the buffer after that, with fresh optimisers and
+        temperature: a share of the interactions.
+      candidates: `(params, memory, task) -> Candidates`, rolled out at the end of
+        each task, or None where nothing is to be chosen.
+      baseline: whether they are rolled out at a task's start, too.
+      in_budget: whether these interactions are part of the task's own.
+      end_task: `(params, memory, task, Selection or None) -> params, memory`.
     """
 
     init: Callable[[jax.Array], tuple[Params, Memory]]
-    start_task: Callable[..., tuple[Params, Memory]]
-    context: Callable[[jax.Array, Memory, bool], Context]
     distribution: Callable[..., tuple[jax.Array, jax.Array]]
-    penalty: Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
-    adjust_updates: Callable[[Params, Memory], Params]
-    candidates: Callable[[Params, Memory, jax.Array], Candidates] | None
-    end_task: Callable[..., tuple[Params, Memory]]
     policy: Callable[[Params, Memory, jax.Array], Policy]
     act: Callable[[Policy, jax.Array], tuple[jax.Array, jax.Array]]
     size: Callable[[Params, Memory], jax.Array]
+    start_task: Callable[..., tuple[Params, Memory]] = (
+        lambda key, params, memory, task: (params, memory)
+    )
+    label: Callable[[jax.Array, Memory, Label, jax.Array], Label] = lambda *_: ()
+    context: Callable[[jax.Array, Memory, Purpose, Label], Context] = lambda *_: ()
+    penalty: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] = lambda *_: (
+        jnp.zeros(()),
+        {},
+    )
+    adjust_updates: Callable[[Params, Memory], Params] = lambda updates, memory: updates
+    critic_input: Callable[[Context, jax.Array], jax.Array] = (
+        lambda context, observation: observation
+    )
+    extra: int = 0
+    fresh_critic: bool = False
+    consolidate: Callable[..., tuple[Params, Memory]] | None = None
+    offline: float = 0.0
+    candidates: Callable[[Params, Memory, jax.Array], Candidates] | None = None
+    baseline: bool = False
+    in_budget: bool = False
+    end_task: Callable[..., tuple[Params, Memory]] = (
+        lambda params, memory, task, selection: (params, memory)
+    )
 
 
 def count(tree: Any) -> int:
     """How many numbers a pytree of arrays holds."""
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
+
+
+def tile(tree: Any, copies: int) -> Any:
+    """Copies of a pytree's arrays, stacked on a new leading axis."""
+    return jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * x.ndim)), tree)
+
+
+def at(tree: Any, index: jax.Array) -> Any:
+    """The entries of a stacked pytree at an index."""
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def put(tree: Any, index: jax.Array, value: Any) -> Any:
+    """A stacked pytree with the entries at an index replaced."""
+    return jax.tree.map(lambda x, v: x.at[index].set(v), tree, value)

@@ -1,47 +1,90 @@
-"""FT-1: one policy, finetuned from task to task."""
+"""Plain policies: one finetuned (FT-1), every one kept (FT-N), all fresh (SAC-N)."""
 
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
 
 from rewire_jax import networks
 from rewire_jax.config import settings
-from rewire_jax.methods.base import Method, Spec, count
+from rewire_jax.methods.base import Method, Spec, at, count, put, tile
 
 
 @settings
-class Ft1Settings:
-    """FT-1 has no settings of its own."""
+class FinetuneSettings:
+    """FT-1, FT-N and SAC-N have no settings of their own."""
 
-    def checked(self) -> "Ft1Settings":
+    def checked(self) -> "FinetuneSettings":
         """The settings as they are."""
         return self
 
 
-def preset(scenario: str, period: int, profile: str) -> Ft1Settings:
+def preset(scenario: str, period: int, profile: str) -> FinetuneSettings:
     """The settings for every scenario and profile."""
     del scenario, period, profile
-    return Ft1Settings()
+    return FinetuneSettings()
 
 
-def ft1(spec: Spec, options: Ft1Settings) -> Method:
+Ft1Settings = FinetuneSettings
+
+
+class Kept(NamedTuple):
+    """The policies of finished tasks.
+
+    Attributes:
+      learned: `[]` int32, how many there are.
+      policies: layers, stacked on a leading axis `[tasks]`.
+    """
+
+    learned: jax.Array
+    policies: tuple[networks.Linear, ...]
+
+
+def ft1(spec: Spec, options: FinetuneSettings) -> Method:
     """The policy of the latest task is the policy of all tasks."""
     del options
-    sizes = [spec.observations, *[spec.hidden] * spec.depth, 2 * spec.actions]
-
-    def init(key):
-        return networks.init_mlp(key, sizes), ()
-
     return Method(
-        init=init,
-        start_task=lambda key, params, memory, task: (params, memory),
-        context=lambda key, memory, learning: (),
+        init=lambda key: (networks.init_mlp(key, spec.sizes()), ()),
         distribution=lambda params, memory, context, observation: networks.mlp_policy(
             params, observation
         ),
-        penalty=lambda *_: (jnp.zeros(()), {}),
-        adjust_updates=lambda updates, memory: updates,
-        candidates=None,
-        end_task=lambda params, memory, task, selection: (params, memory),
         policy=lambda params, memory, task: params,
         act=networks.mlp_policy,
         size=lambda params, memory: jnp.asarray(count(params)),
     )
+
+
+def ft_n(spec: Spec, options: FinetuneSettings) -> Method:
+    """Each task's policy starts as a copy of the last one's, and is kept."""
+    plain = ft1(spec, options)
+
+    def init(key):
+        params, _ = plain.init(key)
+        return params, Kept(jnp.zeros((), jnp.int32), tile(params, spec.tasks))
+
+    def end_task(params, memory, task, selection):
+        del selection
+        return params, Kept(memory.learned + 1, put(memory.policies, task, params))
+
+    def policy(params, memory, task):
+        finished = task < memory.learned
+        own = at(memory.policies, task)
+        return jax.tree.map(lambda a, b: jnp.where(finished, a, b), own, params)
+
+    return plain._replace(
+        init=init,
+        end_task=end_task,
+        policy=policy,
+        size=lambda params, memory: jnp.maximum(memory.learned, 1) * count(params),
+    )
+
+
+def sac_n(spec: Spec, options: FinetuneSettings) -> Method:
+    """Each task's policy starts from fresh weights, and is kept."""
+    plain = ft_n(spec, options)
+
+    def start_task(key, params, memory, task):
+        del params, task
+        return plain.init(key)[0], memory
+
+    return plain._replace(start_task=start_task)

@@ -1,7 +1,7 @@
 """Rewire: multi-mode wirings, their cache, distillation and alignment."""
 
 import dataclasses
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from rewire_jax import networks
 from rewire_jax.config import require, settings, static, traced
 from rewire_jax.methods import wiring
-from rewire_jax.methods.base import Candidates, Method, Spec, count
+from rewire_jax.methods.base import Candidates, Method, Spec, at, count, put, tile
 from rewire_jax.networks import Linear
 
 # The authors' distillation sums over both states of each of 256 transitions, and
@@ -180,8 +180,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         orders = jnp.tile(jnp.arange(n, dtype=jnp.int32), (slots, depth, 1))
         params = Params(
             hidden=hidden,
-            heads=_tile(head, slots),
-            scores=_tile(wiring.spread(orders[0]), places),
+            heads=tile(head, slots),
+            scores=tile(wiring.spread(orders[0]), places),
             adapters=wiring.identity_adapters(depth, n),
         )
         return params, Memory(jnp.zeros((), jnp.int32), hidden, head, orders)
@@ -193,19 +193,19 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
     def start_task(key, params, memory, task):
         del key
         source = known_slot(memory, task)
-        head = _at(params.heads, source)
+        head = at(params.heads, source)
         return Params(
             hidden=params.hidden,
-            heads=_put(params.heads, task % slots, head),
-            scores=_tile(wiring.spread(memory.orders[source]), places),
+            heads=put(params.heads, task % slots, head),
+            scores=tile(wiring.spread(memory.orders[source]), places),
             adapters=wiring.identity_adapters(depth, n),
         ), memory._replace(head=head)
 
-    def context(key, memory, learning):
+    def context(key, memory, purpose, label):
         mode_key, noise_key, key = jax.random.split(key, 3)
         mode = jax.random.randint(mode_key, (), 0, modes)
         noise = jnp.zeros((depth, n))
-        if learning:
+        if purpose != "act":
             noise = options.noise * jax.random.gumbel(noise_key, (depth, n))
         return Context(mode, noise, key)
 
@@ -218,7 +218,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             # of the scores' gradient.
             x = _dropout(drop_key, x, options.dropout)
             x = networks.activate(x)
-        head = _at(params.heads, memory.learned % slots)
+        head = at(params.heads, memory.learned % slots)
         return networks.gaussian(networks.affine(head, x))
 
     def scores_of(params, mode):
@@ -272,7 +272,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
 
     def candidates(params, memory, task):
         del task
-        head = _at(params.heads, memory.learned % slots)
+        head = at(params.heads, memory.learned % slots)
 
         def policy(scores):
             orders = jnp.argsort(scores, axis=-1)
@@ -293,7 +293,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             failed = (memory.learned > 0) & (jnp.max(after) < before)
         began = Params(
             hidden=memory.previous,
-            heads=_put(params.heads, task % slots, memory.head),
+            heads=put(params.heads, task % slots, memory.head),
             scores=params.scores,
             adapters=wiring.identity_adapters(depth, n),
         )
@@ -306,7 +306,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         return Params(
             hidden=params.hidden,
             heads=params.heads,
-            scores=_tile(wiring.spread(order), places),
+            scores=tile(wiring.spread(order), places),
             adapters=wiring.identity_adapters(depth, n),
         ), Memory(
             learned=memory.learned + 1,
@@ -318,7 +318,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
     def policy(params, memory, task):
         slot = known_slot(memory, task)
         folded = wiring.fold(params.hidden, memory.orders[slot])
-        return [*folded, _at(params.heads, slot)]
+        return [*folded, at(params.heads, slot)]
 
     def size(params, memory):
         one_mode = depth * n
@@ -333,6 +333,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         penalty=penalty,
         adjust_updates=adjust_updates,
         candidates=candidates,
+        baseline=True,
         end_task=end_task,
         policy=policy,
         act=networks.mlp_policy,
@@ -366,15 +367,3 @@ def _dropout(key: jax.Array, x: jax.Array, rate: float) -> jax.Array:
         return x
     kept = jax.random.bernoulli(key, 1 - rate, x.shape)
     return jnp.where(kept, x / (1 - rate), 0.0)
-
-
-def _tile(tree: Any, copies: int) -> Any:
-    return jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * x.ndim)), tree)
-
-
-def _at(tree: Any, index: jax.Array) -> Any:
-    return jax.tree.map(lambda x: x[index], tree)
-
-
-def _put(tree: Any, index: jax.Array, value: Any) -> Any:
-    return jax.tree.map(lambda x, v: x.at[index].set(v), tree, value)

@@ -1,0 +1,216 @@
+"""The compiled functions of a run, over a whole population."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax import replay, rollout, sac, training
+from rewire_jax.envs.base import Environment, Task
+from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools
+from rewire_jax.training import Collection, Report, Shape, State
+
+
+class Program(NamedTuple):
+    """The compiled functions of a run; the first axis of all is `[members]`.
+
+    A function is traced once, whatever the task: tasks and times are data.
+
+    Attributes:
+      init: `members -> Learner`.
+      begin: `(members, learner, alive, index, task) -> State`, a task's start.
+      chunk: `(members, state, index, task, time, steps) -> state, Report`, takes
+        `steps` steps of all environments; the given state is used up.
+      consolidate: `(members, state, index, time) -> Learner`, the end of a task's
+        interactions, `time` steps of all environments; or None.
+      polish: `(members, state, index, time, done, steps) -> state, Report`, updates
+        from the buffer as in `steps` steps, `done` of which were made before.
+      candidates: `(members, learner, index) -> Candidates`, or None.
+      finish: `(members, learner, index, Selection or None) -> Learner`.
+      policies: `(members, learner) -> policies [members, tasks]`.
+      rollout: `(tasks, policies, keys, count) -> Rollout`, see `rollout.episodes`.
+      size: `(members, learner) -> [members]`, numbers stored.
+      baseline: whether candidates are rolled out at a task's start, too.
+    """
+
+    init: Callable[..., sac.Learner]
+    begin: Callable[..., State]
+    chunk: Callable[..., tuple[State, Report]]
+    consolidate: Callable[..., sac.Learner] | None
+    polish: Callable[..., tuple[State, Report]]
+    candidates: Callable[..., Candidates] | None
+    finish: Callable[..., sac.Learner]
+    policies: Callable[..., Any]
+    rollout: Callable[..., rollout.Rollout]
+    size: Callable[..., jax.Array]
+    baseline: bool
+
+
+@functools.lru_cache
+def rollout_function(
+    environment: Environment, act: Callable[..., Any], rows: int, count: int
+) -> Callable[..., rollout.Rollout]:
+    """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
+
+    Methods whose policies are computed alike share one compiled function.
+    """
+
+    def episodes(tasks: Task, policies: Any, keys: jax.Array) -> rollout.Rollout:
+        assert keys.shape[1] == rows
+        return rollout.episodes(environment, act, tasks, policies, keys, count)
+
+    return jax.jit(episodes)
+
+
+@functools.lru_cache
+def build(
+    environment: Environment,
+    make: Callable[[Spec, Any], Method],
+    spec: Spec,
+    shape: Shape,
+    example: Any,
+) -> Program:
+    """The functions of a run; runs alike in all but numbers share them.
+
+    Args:
+      environment: of the scenario.
+      make: the method's constructor.
+      spec: sizes of the networks and of the sequence.
+      shape: sizes of the loop.
+      example: one member's method settings, for what is static about the method.
+    """
+
+    def init(member):
+        key = jax.random.fold_in(member.keys, 0)
+        return sac.init(key, make(spec, member.options), spec, member.sac)
+
+    def task_keys(member, index):
+        # For the start, the steps, consolidation and polishing. A key is either split
+        # or folded, never both: `split(key)[i]` is the same key as `fold_in(key, i)`.
+        key = jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
+        return jax.random.split(key, 4)
+
+    def begin(member, learner, alive, index, task):
+        method = make(spec, member.options)
+        keys = jax.random.split(task_keys(member, index)[0], 4)
+        start_key, reset_key, critic_key, label_key = keys
+        params, memory = method.start_task(
+            start_key, learner.params, learner.memory, index
+        )
+        learner = learner._replace(params=params, memory=memory)
+        if method.fresh_critic:
+            critic = sac.init_critic(critic_key, spec, method.extra)
+            learner = learner._replace(critic=critic)
+        keys = jax.random.split(reset_key, shape.envs)
+        episodes = jax.vmap(lambda k: rollout.begin(environment, task, k))(keys)
+        label = method.label(label_key, memory, None, episodes.steps)
+        buffer = replay.create(
+            episodes.state.observation,
+            transitions=shape.transitions,
+            actions=spec.actions,
+            episode_length=environment.episode_length,
+            label=label,
+        )
+        learner = sac.restart(learner, member.sac)
+        return State(learner, Collection(buffer, episodes, label), alive)
+
+    def chunk(member, state, index, task, time, steps):
+        return training.train(
+            task_keys(member, index)[1],
+            state,
+            task,
+            time,
+            steps,
+            environment=environment,
+            method=make(spec, member.options),
+            settings=member.sac,
+            shape=shape,
+        )
+
+    def consolidate(member, state, index, time):
+        method = make(spec, member.options)
+        assert method.consolidate is not None
+        learner, buffer = state.learner, state.collection.buffer
+
+        def sample(key, count):
+            return replay.sample(buffer, key, time, count, environment.episode_length)
+
+        def q(context, observation, action):
+            inputs = method.critic_input(context, observation)
+            return sac.q_values(learner.critic, inputs, action)
+
+        key = task_keys(member, index)[2]
+        params, memory = method.consolidate(
+            key, learner.params, learner.memory, index, Tools(sample, q)
+        )
+        learner = learner._replace(params=params, memory=memory)
+        return sac.restart(learner, member.sac)
+
+    def polish(member, state, index, time, done, steps):
+        update = functools.partial(
+            training.learn,
+            environment=environment,
+            method=make(spec, member.options),
+            settings=member.sac,
+        )
+        key = task_keys(member, index)[3]
+
+        def step(number, carry):
+            state, report = carry
+            state, metrics = update(
+                jax.random.fold_in(key, number),
+                state,
+                time,
+                number * shape.updates,
+                shape.updates,
+            )
+            metrics = jax.tree.map(jnp.add, report.metrics, metrics)
+            return state, report._replace(updates=report.updates + 1, metrics=metrics)
+
+        report = training.empty_report(update, key, state)
+        return jax.lax.fori_loop(done, done + steps, step, (state, report))
+
+    def candidates(member, learner, index):
+        method = make(spec, member.options)
+        assert method.candidates is not None
+        return method.candidates(learner.params, learner.memory, index)
+
+    def finish(member, learner, index, selection: Selection | None):
+        method = make(spec, member.options)
+        params, memory = method.end_task(
+            learner.params, learner.memory, index, selection
+        )
+        return learner._replace(params=params, memory=memory)
+
+    def policies(member, learner):
+        method = make(spec, member.options)
+        policy = functools.partial(method.policy, learner.params, learner.memory)
+        return jax.vmap(policy)(jnp.arange(spec.tasks))
+
+    def rollout_episodes(tasks, policies, keys, count):
+        function = rollout_function(environment, method.act, keys.shape[1], count)
+        return function(tasks, policies, keys)
+
+    def size(member, learner):
+        return make(spec, member.options).size(learner.params, learner.memory)
+
+    method = make(spec, example)
+    chunk_axes = (0, 0, None, None, None, None)
+    return Program(
+        init=jax.jit(jax.vmap(init)),
+        begin=jax.jit(jax.vmap(begin, (0, 0, 0, None, None))),
+        chunk=jax.jit(jax.vmap(chunk, chunk_axes), donate_argnums=1),
+        consolidate=method.consolidate
+        and jax.jit(jax.vmap(consolidate, (0, 0, None, None))),
+        polish=jax.jit(
+            jax.vmap(polish, (0, 0, None, None, None, None)), donate_argnums=1
+        ),
+        candidates=method.candidates and jax.jit(jax.vmap(candidates, (0, 0, None))),
+        finish=jax.jit(jax.vmap(finish, (0, 0, None, 0))),
+        policies=jax.jit(jax.vmap(policies)),
+        rollout=rollout_episodes,
+        size=jax.jit(jax.vmap(size)),
+        baseline=method.baseline,
+    )
