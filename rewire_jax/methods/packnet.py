@@ -1,0 +1,146 @@
+"""PackNet: each task keeps a share of one network's weights (arXiv 1711.05769)."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from rewire_jax import networks
+from rewire_jax.config import require, settings, static
+from rewire_jax.methods.base import Method, Spec, count
+
+FREE = -1
+"""Owner of the weights that no task has kept."""
+
+
+@settings
+class PackNetSettings:
+    """PackNet.
+
+    Attributes:
+      keep: share of each layer's weights, and of its biases, that a task keeps,
+        rounded up. After 1 / keep tasks the network is full: later tasks find
+        nothing to train and are played by the weights of those before.
+      finetune: updates of the kept weights after the pruning, for each interaction
+        of the task.
+    """
+
+    keep: float = 0.125
+    finetune: float = static(0.1)
+
+    def checked(self) -> "PackNetSettings":
+        """The settings as they are; `UserError` if they make no sense."""
+        require(0 < self.keep <= 1, f"--keep must lie in (0, 1], not {self.keep}")
+        require(
+            0 <= self.finetune < jnp.inf,
+            f"--finetune must be at least 0, not {self.finetune}",
+        )
+        return self
+
+
+def preset(scenario: str, period: int, profile: str) -> PackNetSettings:
+    """Published settings, with room for every task of a round.
+
+    Published are 12.5% for each task, and 100,000 updates after 1M interactions or,
+    on Humanoid, 2M.
+    """
+    del profile
+    return PackNetSettings(
+        keep=min(0.125, 1 / period),
+        finetune=0.05 if scenario == "humanoid/hard" else 0.1,
+    )
+
+
+class Memory(NamedTuple):
+    """Who owns what.
+
+    Attributes:
+      learned: `[]` number of finished tasks.
+      owners: for every weight and bias the task that keeps it, or `FREE`.
+      trained: `[]` owner of the weights that updates change: `FREE` until the
+        pruning, then the task.
+    """
+
+    learned: jax.Array
+    owners: Any
+    trained: jax.Array
+
+
+def packnet(spec: Spec, options: PackNetSettings) -> Method:
+    """A task trains the free weights, prunes them, and finetunes those it keeps."""
+
+    def init(key):
+        params = networks.init_mlp(key, spec.sizes())
+        owners = jax.tree.map(lambda x: jnp.full(x.shape, FREE, jnp.int32), params)
+        return params, Memory(
+            learned=jnp.zeros((), jnp.int32),
+            owners=owners,
+            trained=jnp.full((), FREE, jnp.int32),
+        )
+
+    def adjust_updates(updates, memory):
+        return jax.tree.map(
+            lambda update, owner: jnp.where(owner == memory.trained, update, 0.0),
+            updates,
+            memory.owners,
+        )
+
+    def consolidate(key, params, memory, task, tools):
+        del key, tools
+        owners = jax.tree.map(
+            lambda x, owner: jnp.where(
+                largest(x, owner == FREE, options.keep), task, owner
+            ),
+            params,
+            memory.owners,
+        )
+        # What is pruned starts the next task at 0.
+        params = jax.tree.map(
+            lambda x, owner: jnp.where(owner == FREE, 0.0, x), params, owners
+        )
+        trained = jnp.full_like(memory.trained, task)
+        return params, memory._replace(owners=owners, trained=trained)
+
+    def end_task(params, memory, task, selection):
+        del task, selection
+        return params, memory._replace(
+            learned=memory.learned + 1, trained=jnp.full_like(memory.trained, FREE)
+        )
+
+    def policy(params, memory, task):
+        # Whole for a task not yet learned: beyond what is owned it holds zeros, or,
+        # before the first task, the weights that it will start from.
+        def part(x, owner):
+            kept = (owner != FREE) & (owner <= task)
+            return jnp.where(kept | (task >= memory.learned), x, 0.0)
+
+        return jax.tree.map(part, params, memory.owners)
+
+    return Method(
+        init=init,
+        distribution=lambda params, memory, context, observation: networks.mlp_policy(
+            params, observation
+        ),
+        policy=policy,
+        act=networks.mlp_policy,
+        size=lambda params, memory: jnp.asarray(count(params) + count(memory.owners)),
+        adjust_updates=adjust_updates,
+        consolidate=consolidate,
+        offline=options.finetune,
+        end_task=end_task,
+    )
+
+
+def largest(x: jax.Array, free: jax.Array, keep: ArrayLike) -> jax.Array:
+    """Mask of the free entries of largest magnitude.
+
+    Args:
+      x: array of any shape.
+      free: bool, of its shape.
+      keep: share of all its entries to choose, rounded up; at most those free are.
+        Of equal magnitudes the first are chosen.
+    """
+    magnitude = jnp.where(free, jnp.abs(x), -1.0).ravel()
+    ranks = jnp.argsort(jnp.argsort(magnitude, descending=True))
+    return free & (ranks < jnp.ceil(keep * x.size)).reshape(x.shape)
