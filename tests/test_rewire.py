@@ -739,6 +739,62 @@ def test_spare_places_change_nothing():
     assert np.any(memory.orders[0, 1] != memory.orders[1, 1])
 
 
+# Variants (Table 3)
+
+
+def test_alignment_off_is_a_distance_of_weights_and_moves_no_wiring():
+    method, rng = make(alignment="off", alpha=0.0, beta=2.0), np.random.default_rng(20)
+    params, memory = after_tasks(method, 2, rng)
+    began, memory = method.start_task(KEY, params, memory, 2)
+    moved = trained(rng, began)._replace(adapters=began.adapters)
+
+    def loss(params):
+        context = Context(0, QUIET, KEY)
+        gaussian = method.distribution(params, memory, context, OBSERVATION)
+        return method.penalty(KEY, params, memory, context, OBSERVATION, gaussian)[0]
+
+    value, gradient = jax.value_and_grad(loss)(moved)
+    gaps = jax.tree.map(np.subtract, moved.hidden, memory.previous)
+    squares = sum(np.sum(gap.astype(np.float64) ** 2) for gap in jax.tree.leaves(gaps))
+    np.testing.assert_allclose(value, 2 * squares, rtol=1e-5)
+    assert_near(
+        jax.tree.leaves(gradient.hidden), [4 * gap for gap in jax.tree.leaves(gaps)]
+    )
+    for leaf in jax.tree.leaves((gradient.adapters, gradient.scores)):
+        np.testing.assert_array_equal(leaf, 0)
+    _, kept = method.end_task(moved, memory, 2, None)
+    np.testing.assert_array_equal(kept.orders[:2], memory.orders[:2])
+    stored = make().size(params, memory) - method.size(params, memory)
+    assert stored == (2 * DEPTH - 1) * N
+
+
+def test_without_caching_all_tasks_share_the_latest_wiring():
+    method, rng = make(caching=False), np.random.default_rng(21)
+    params, memory = after_tasks(method, 3, rng)
+    assert memory.orders.shape == (1, DEPTH, N)
+    assert np.any(memory.orders[0] != np.arange(N))
+    for task in range(3):
+        played = method.act(method.policy(params, memory, task), OBSERVATION)
+        head = head_at(params, task)
+        assert_near(played, play(params.hidden, memory.orders[0], head))
+    began, _ = method.start_task(KEY, params, memory, 3)
+    np.testing.assert_array_equal(orders_of(began.scores[0]), memory.orders[0])
+    cached = make()
+    spared = cached.size(*cached.init(KEY)) - method.size(*method.init(KEY))
+    assert spared == (SLOTS - 1) * DEPTH * N
+
+
+def test_the_policy_may_have_a_width_of_its_own():
+    method = make(width=9)
+    params, memory = method.init(KEY)
+    assert params.scores.shape == (K, DEPTH, 9)
+    same = make(SPEC._replace(hidden=9))
+    assert method.size(params, memory) == same.size(params, memory)
+    context = Context(0, QUIET[:, :9], KEY)
+    mean, _ = method.distribution(params, memory, context, OBSERVATION)
+    assert mean.shape == (7, ACTIONS)
+
+
 # Sizes
 
 # Observations, actions, heads, FACTS.md's figure or None, numbers stored by hand:
@@ -798,6 +854,7 @@ def test_base_sizes_as_published():
         ({"tau": 0.0}, "--tau"),
         ({"adapter_tau": -0.1}, "--adapter-tau"),
         ({"adapter_rate": -1.0}, "--adapter-rate"),
+        ({"width": -1}, "--width"),
     ],
 )
 def test_senseless_settings_are_told(values, message):

@@ -250,7 +250,7 @@ def test_the_first_actions_are_uniform_and_do_not_ask_the_policy(program, starte
 
 def test_the_buffer_holds_what_the_environments_did(program, whole):
     state, _ = whole
-    buffer, episodes = state.collection
+    buffer, episodes, _ = state.collection
     rows = SHAPE.transitions + 1
     last = 25 % rows
     equal(buffer.observation[:, last], episodes.state.observation)

@@ -30,7 +30,10 @@ class RewireSettings:
         differences of mean and log-std.
       beta: weight of the alignment loss.
       alignment: "norm" is Eq. 11; "expanded" the authors' form of it, whose
-        gradient in the adapters differs.
+        gradient in the adapters differs; "off" holds the weights near the previous
+        ones as they are, and leaves the cached wirings alone (Table 3).
+      caching: whether each task's wiring is cached; otherwise all tasks use the
+        latest (Table 3).
       tau: temperature of the wirings' relaxation (Eq. 4).
       adapter_tau: the same for the adapters.
       adapter_rate: factor on the adapters' learning rate. At 1, as in the authors'
@@ -43,6 +46,8 @@ class RewireSettings:
         which Adam all but undoes.
       head_slots: output heads and cached orders; task t uses slot t mod this, so
         that a repeated task finds its own again.
+      width: neurons in each hidden layer of the policy; 0 for as many as the critics
+        have. 384 is the paper's Ours-L (Fig. 4).
     """
 
     modes: int = traced(3)
@@ -50,7 +55,8 @@ class RewireSettings:
     alpha: float = 1e-5
     distillation: Literal["kl", "squares"] = "kl"
     beta: float = 1.0
-    alignment: Literal["norm", "expanded"] = "norm"
+    alignment: Literal["norm", "expanded", "off"] = "norm"
+    caching: bool = True
     tau: float = 1.0
     adapter_tau: float = 0.1
     adapter_rate: float = 1.0
@@ -58,6 +64,7 @@ class RewireSettings:
     dropout: float = static(0.0)
     mode_rate: Literal["step", "gradient"] = "step"
     head_slots: int = 4
+    width: int = 0
 
     def checked(self) -> "RewireSettings":
         """The settings with their places counted; `UserError` if they make no sense."""
@@ -67,6 +74,7 @@ class RewireSettings:
             f"--mode-slots {self.mode_slots} has no place for --modes {self.modes}",
         )
         require(self.head_slots >= 1, "--head-slots must be at least 1")
+        require(self.width >= 0, f"--width must be at least 0, not {self.width}")
         for name in ("alpha", "beta", "noise", "adapter_rate"):
             value = getattr(self, name)
             flag = name.replace("_", "-")
@@ -143,7 +151,8 @@ class Memory(NamedTuple):
       learned: `[]` int32, finished tasks.
       previous: hidden layers at the end of the previous task.
       head: the current task's head as it was when the task began.
-      orders: `[slots, L, n]` int32, the cached wirings.
+      orders: `[slots, L, n]` int32, the cached wirings; a single one without
+        caching.
     """
 
     learned: jax.Array
@@ -168,8 +177,9 @@ class Context(NamedTuple):
 
 def rewire(spec: Spec, options: RewireSettings) -> Method:
     """The method of the paper."""
-    n, depth = spec.hidden, spec.depth
+    n, depth = options.width or spec.hidden, spec.depth
     slots = min(options.head_slots, spec.tasks)
+    cached = slots if options.caching else 1
     places = options.mode_slots
     modes = jnp.asarray(options.modes)
 
@@ -177,7 +187,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         hidden_key, head_key = jax.random.split(key)
         hidden = networks.init_mlp(hidden_key, [spec.observations, *[n] * depth])
         head = networks.init_linear(head_key, n, 2 * spec.actions)
-        orders = jnp.tile(jnp.arange(n, dtype=jnp.int32), (slots, depth, 1))
+        orders = jnp.tile(jnp.arange(n, dtype=jnp.int32), (cached, depth, 1))
         params = Params(
             hidden=hidden,
             heads=tile(head, slots),
@@ -197,7 +207,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         return Params(
             hidden=params.hidden,
             heads=put(params.heads, task % slots, head),
-            scores=tile(wiring.spread(memory.orders[source]), places),
+            scores=tile(wiring.spread(memory.orders[source % cached]), places),
             adapters=wiring.identity_adapters(depth, n),
         ), memory._replace(head=head)
 
@@ -246,13 +256,16 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         )
         divergence = _DIVERGENCES[options.distillation](other, gaussian)
         distillation = jnp.where(modes > 1, jnp.mean(divergence), 0.0)
-        alignment = wiring.alignment_loss(
-            params.hidden,
-            memory.previous,
-            params.adapters,
-            options.adapter_tau,
-            expanded=options.alignment == "expanded",
-        )
+        if options.alignment == "off":
+            alignment = wiring.squared_distance(params.hidden, memory.previous)
+        else:
+            alignment = wiring.alignment_loss(
+                params.hidden,
+                memory.previous,
+                params.adapters,
+                options.adapter_tau,
+                expanded=options.alignment == "expanded",
+            )
         alignment = jnp.where(memory.learned > 0, alignment, 0.0)
         loss = options.alpha * DISTILLED_STATES * distillation
         return loss + options.beta * alignment, {
@@ -298,7 +311,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             adapters=wiring.identity_adapters(depth, n),
         )
         params = jax.tree.map(lambda a, b: jnp.where(failed, a, b), began, params)
-        order = jnp.where(failed, memory.orders[known_slot(memory, task)], order)
+        latest = memory.orders[known_slot(memory, task) % cached]
+        order = jnp.where(failed, latest, order)
         refined = wiring.refine(memory.orders, params.adapters)
         # Before the first task there is nothing the weights could be aligned with.
         refined = jnp.where(memory.learned > 0, refined, memory.orders)
@@ -312,17 +326,19 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             learned=memory.learned + 1,
             previous=params.hidden,
             head=memory.head,
-            orders=refined.at[task % slots].set(order),
+            orders=refined.at[task % slots % cached].set(order),
         )
 
     def policy(params, memory, task):
         slot = known_slot(memory, task)
-        folded = wiring.fold(params.hidden, memory.orders[slot])
+        folded = wiring.fold(params.hidden, memory.orders[slot % cached])
         return [*folded, at(params.heads, slot)]
 
     def size(params, memory):
         one_mode = depth * n
         stored = count(params) - (places - modes) * one_mode
+        if options.alignment == "off":
+            stored -= count(params.adapters)
         return stored + count(memory.previous) + count(memory.head) + memory.orders.size
 
     return Method(

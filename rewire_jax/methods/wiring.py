@@ -96,15 +96,19 @@ def alignment_loss(
       expanded: leave out the square of the adapted weights, constant under true
         permutations but not under their relaxation (the authors' code).
     """
-    loss = jnp.zeros(())
     adapted = adapt(previous, adapters, tau)
+    if not expanded:
+        return squared_distance(hidden, adapted)
     leaves = zip(jax.tree.leaves(hidden), jax.tree.leaves(adapted), strict=True)
-    for now, then in leaves:
-        if expanded:
-            loss += jnp.sum(now**2 - 2 * now * then)
-        else:
-            loss += jnp.sum((now - then) ** 2)
-    return loss
+    return sum(
+        (jnp.sum(now**2 - 2 * now * then) for now, then in leaves), jnp.zeros(())
+    )
+
+
+def squared_distance(hidden: Hidden, others: Hidden) -> jax.Array:
+    """Sum of squared differences of all weights and biases."""
+    leaves = zip(jax.tree.leaves(hidden), jax.tree.leaves(others), strict=True)
+    return sum((jnp.sum((now - then) ** 2) for now, then in leaves), jnp.zeros(()))
 
 
 def refine(orders: jax.Array, adapters: Adapters) -> jax.Array:
