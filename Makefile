@@ -16,7 +16,7 @@ option = $(if $(strip $(2)),--$(1) $(2))
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
-	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED BACKEND OUT where set.'
+	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS BACKEND OUT where set.'
 
 setup: $(STAMP) ## Make .venv with the pinned versions (does nothing when up to date)
 
@@ -79,6 +79,7 @@ bench-brax: setup ## Run the methods on a Brax scenario, make its table and figu
 		$(call option,profile,$(PROFILE)) \
 		$(call option,seeds,$(SEEDS)) \
 		$(call option,seed,$(SEED)) \
+		$(call option,interactions,$(INTERACTIONS)) \
 		$(call option,backend,$(BACKEND)) \
 		$(call option,out,$(OUT)) \
 		$(if $(KEEP),--keep))

@@ -12,6 +12,7 @@ import tyro
 
 import rewire_jax
 from rewire_jax.errors import UserError
+from rewire_jax.methods import METHODS
 from rewire_jax.report import to_terminal
 from rewire_jax.rundata import read_run
 from rewire_jax.runfolder import HEADER
@@ -23,10 +24,11 @@ class Bench:
 
     Attributes:
       scenario: name of the scenario.
-      methods: names of the methods, run one after the other.
+      methods: names of the methods, run one after the other; "all" for every one.
       profile: "quick" or "paper".
       seeds: members of each run; 0 takes the profile's.
       seed: of the first member.
+      interactions: of training for each task; 0 takes the profile's.
       backend: physics backend.
       out: folder for runs and report; named after scenario and profile if not given.
       keep: also put the report under experiments/results, to be committed.
@@ -37,6 +39,7 @@ class Bench:
     profile: str = "quick"
     seeds: int = 1
     seed: int = 0
+    interactions: int = 0
     backend: str = "positional"
     out: Path | None = None
     keep: bool = False
@@ -50,12 +53,15 @@ def run(bench: Bench) -> None:
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
     name = f"{bench.scenario.replace('/', '-')}-{bench.profile}"
+    if bench.interactions:
+        name += f"-{bench.interactions}"
     out = bench.out or Path("runs") / name
     scenario = rewire_jax.make_scenario(bench.scenario, bench.backend)
     # Wrong names are found before the first method has run for hours.
+    names = METHODS if "all" in bench.methods else bench.methods
     plans = {
         method: rewire_jax.preset(scenario, method, bench.profile)
-        for method in dict.fromkeys(bench.methods)
+        for method in dict.fromkeys(names)
     }
     folders = []
     for method, settings in plans.items():
@@ -66,7 +72,12 @@ def run(bench: Bench) -> None:
             print(f"{folder}: finished before, not run again", file=sys.stderr)
             continue
         rewire_jax.train(
-            replace(settings, seeds=bench.seeds, seed=bench.seed),
+            replace(
+                settings,
+                seeds=bench.seeds,
+                seed=bench.seed,
+                interactions=bench.interactions or settings.interactions,
+            ),
             folder,
             scenario=scenario,
             resume=started,
