@@ -20,8 +20,8 @@ class PackNetSettings:
 
     Attributes:
       keep: share of each layer's weights, and of its biases, that a task keeps,
-        rounded up. After 1 / keep tasks the network is full: later tasks find
-        nothing to train and are played by the weights of those before.
+        rounded up. After 1 / keep tasks at the latest the network is full: later
+        tasks find nothing to train and are played by the weights of those before.
       finetune: updates of the kept weights after the pruning, for each interaction
         of the task.
     """
