@@ -818,7 +818,7 @@ def test_model_size(row):
     by_hand = 2 * hidden + (heads + 1) * head + 3 * 768 + 5 * 256 + heads * 768
     assert by_hand == stored
     spec = Spec(observations, actions, 256, 3, 8)
-    baseline = finetune.ft1(spec, finetune.Ft1Settings())
+    baseline = finetune.ft1(spec, finetune.FinetuneSettings())
     params, memory = jax.eval_shape(baseline.init, KEY)
     assert baseline.size(params, memory) == hidden + head
 
@@ -834,7 +834,7 @@ def test_model_size(row):
 def test_base_sizes_as_published():
     for observations, actions, base in ((18, 6, 139_532), (27, 8, 142_864)):
         spec = Spec(observations, actions, 256, 3, 8)
-        method = finetune.ft1(spec, finetune.Ft1Settings())
+        method = finetune.ft1(spec, finetune.FinetuneSettings())
         assert method.size(*jax.eval_shape(method.init, KEY)) == base
 
 

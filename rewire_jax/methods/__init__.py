@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rewire_jax.errors import UserError
-from rewire_jax.methods import finetune
+from rewire_jax.methods import finetune, packnet, progressive, regularize
 from rewire_jax.methods import rewire as rewiring
 from rewire_jax.methods.base import Method, Spec
 
@@ -28,8 +28,15 @@ class Entry(NamedTuple):
     selection_episodes: int | None = None
 
 
+# In the order of the paper's Table 1.
 METHODS: dict[str, Entry] = {
-    "ft1": Entry(finetune.ft1, finetune.Ft1Settings, finetune.preset),
+    "ft1": Entry(finetune.ft1, finetune.FinetuneSettings, finetune.preset),
+    "ft_l2": Entry(regularize.ft_l2, regularize.FtL2Settings, regularize.preset_ft_l2),
+    "packnet": Entry(packnet.packnet, packnet.PackNetSettings, packnet.preset),
+    "ewc": Entry(regularize.ewc, regularize.EwcSettings, regularize.preset_ewc),
+    "pnn": Entry(progressive.pnn, progressive.PnnSettings, progressive.preset),
+    "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
+    "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
     "rewire": Entry(rewiring.rewire, rewiring.RewireSettings, rewiring.preset),
 }
 

@@ -25,9 +25,6 @@ def preset(scenario: str, period: int, profile: str) -> FinetuneSettings:
     return FinetuneSettings()
 
 
-Ft1Settings = FinetuneSettings
-
-
 class Kept(NamedTuple):
     """The policies of finished tasks.
 

@@ -36,9 +36,11 @@ class RewireSettings:
         latest (Table 3).
       tau: temperature of the wirings' relaxation (Eq. 4).
       adapter_tau: the same for the adapters.
-      adapter_rate: factor on the adapters' learning rate. At 1, as in the authors'
-        code, Adam moves the adapters' scores past each other within some ten steps
-        even where their gradient is next to nothing.
+      adapter_rate: factor on the adapters' learning rate; 1 in the authors' code.
+        Adam at first moves the adapters' scores past each other, whatever the size
+        of their gradient. In the "expanded" form they then spread until their order
+        settles and the weights catch up with it, the sooner the higher the rate:
+        after some 10,000 policy updates at 1. In the "norm" form they never settle.
       noise: scale of Gumbel noise on the scores in updates.
       dropout: share of each hidden layer's output dropped in training.
       mode_rate: the learning rate of scores is multiplied by K: "step" scales the
@@ -104,14 +106,14 @@ _PUBLISHED = {
 def preset(scenario: str, period: int, profile: str) -> RewireSettings:
     """Published settings, or the defaults with a head for each task of a round.
 
-    The quick profile's `beta` and `adapter_rate` are ours: with the published ones
-    the adapters drift apart before the weights have learned anything (see
-    `adapter_rate`), and a short run has no time to make up for it.
+    The published `beta` belongs to the authors' form of the alignment loss. The quick
+    profile's `adapter_rate` is ours: in its few updates the adapters would else not
+    settle (see `adapter_rate`).
     """
-    published = _published(scenario, period)
+    published = dataclasses.replace(_published(scenario, period), alignment="expanded")
     if profile == "paper":
         return published
-    return dataclasses.replace(published, beta=1.0, adapter_rate=0.01)
+    return dataclasses.replace(published, adapter_rate=10.0)
 
 
 def _published(scenario: str, period: int) -> RewireSettings:
