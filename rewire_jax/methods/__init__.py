@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rewire_jax.errors import UserError
-from rewire_jax.methods import finetune, packnet, progressive, regularize
+from rewire_jax.methods import finetune, packnet, progressive, regularize, subspace
 from rewire_jax.methods import rewire as rewiring
 from rewire_jax.methods.base import Method, Spec
 
@@ -37,6 +37,7 @@ METHODS: dict[str, Entry] = {
     "pnn": Entry(progressive.pnn, progressive.PnnSettings, progressive.preset),
     "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
     "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
+    "csp": Entry(subspace.csp, subspace.CspSettings, subspace.preset, 8),
     "rewire": Entry(rewiring.rewire, rewiring.RewireSettings, rewiring.preset),
 }
 
