@@ -130,17 +130,52 @@ class _Stop(Exception):
     pass
 
 
-def stop_after(monkeypatch: pytest.MonkeyPatch, chunks: int) -> None:
-    chunk = continual.Run.chunk
+def stop_after(
+    monkeypatch: pytest.MonkeyPatch, times: int, name: str = "chunk"
+) -> None:
+    called = getattr(continual.Run, name)
     calls = []
 
     def counting(self, *rest):
-        if len(calls) == chunks:
+        if len(calls) == times:
             raise _Stop
         calls.append(None)
-        return chunk(self, *rest)
+        return called(self, *rest)
 
-    monkeypatch.setattr(continual.Run, "chunk", counting)
+    monkeypatch.setattr(continual.Run, name, counting)
+
+
+# PackNet in the updates after its second pruning; CSP with labels in its buffer, in a
+# task that ends with a search.
+@pytest.mark.parametrize(
+    ("method", "times", "name", "resumed"),
+    [
+        ("packnet", 3, "polish", "task-001-step-0000040"),
+        ("csp", 5, "chunk", "task-001-step-0000020"),
+    ],
+)
+def test_what_a_method_needs_within_a_task_is_saved(
+    method: str,
+    times: int,
+    name: str,
+    resumed: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=8)
+    whole = continual.train(settings, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_after(patch, times, name)
+        with pytest.raises(_Stop):
+            continual.train(settings, tmp_path / "parts")
+    assert checkpoints(tmp_path / "parts")[-1] == resumed
+    parts = continual.train(settings, tmp_path / "parts", resume=True)
+    for table in TABLES:
+        assert (parts / table).read_bytes() == (whole / table).read_bytes()
+    for ours, theirs in zip(
+        leaves(parts, settings), leaves(whole, settings), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize(("chunks", "damaged"), [(7, 1), (7, 2), (4, 1), (1, 0)])
