@@ -1,12 +1,15 @@
 """Continual-learning metrics on plain arrays of scores.
 
 A matrix is `[..., stages, tasks]`: entry `[s, t]` is the score on task `t` after
-training on task `s`, so a whole sequence of T tasks gives `[..., T, T]`.
-Definitions: FACTS.md, section 4, "Metrics".
+training on task `s`, so a whole sequence of T tasks gives `[..., T, T]`. The measures
+are those of the paper's section 4.1 and appendix A.3; interquartile mean and interval
+are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (NeurIPS 2021).
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 Scores = NDArray[np.float64]
 
@@ -66,3 +69,92 @@ def performance(matrix: ArrayLike) -> Scores:
         `[...]`.
     """
     return np.asarray(final(matrix).mean(axis=-1))
+
+
+def normalise(matrix: ArrayLike, reference: ArrayLike) -> Scores:
+    """Scores divided by the reference's average over the tasks.
+
+    All tasks share one divisor, so that a normalised performance is a ratio of
+    averages. A ratio for each task would mean nothing where the reference's return on
+    that task is negative, and be all noise where it is close to 0.
+
+    Args:
+        matrix: `[..., tasks]`, a matrix or what was taken from one.
+        reference: `[tasks]`, the score of each task at the end; SAC-N's on Brax.
+
+    Returns:
+        `[..., tasks]`.
+
+    Raises:
+        ValueError: if the reference's average is not above 0.
+    """
+    scale = np.mean(np.asarray(reference, np.float64))
+    if not scale > 0:
+        raise ValueError(f"cannot normalise with an average of {scale:g}")
+    return np.asarray(matrix, np.float64) / scale
+
+
+def forward_transfer(matrix: ArrayLike, reference: ArrayLike) -> Scores:
+    """Score right after own training minus the reference's there, for each task.
+
+    Positive where what was learned before was of use.
+
+    Args:
+        matrix: `[..., tasks, tasks]`, normalised where the reference is.
+        reference: `[..., tasks]`, the score right after own training of a method that
+            learns every task from scratch; SAC-N's on Brax.
+
+    Returns:
+        `[..., tasks]`.
+    """
+    return after_own_training(matrix) - np.asarray(reference, np.float64)
+
+
+def interquartile_mean(values: ArrayLike) -> Scores:
+    """Mean of the middle half: a quarter, rounded down, is cut from either end.
+
+    Args:
+        values: `[..., n]`.
+
+    Returns:
+        `[...]`, NaN where a value is.
+    """
+    values = np.asarray(values, np.float64)
+    return np.asarray(stats.trim_mean(values, 0.25, axis=-1))
+
+
+def stratified_bootstrap(
+    scores: ArrayLike, *, level: float = 0.95, resamples: int = 10_000, seed: int = 0
+) -> tuple[float, float] | None:
+    """Percentile interval of the interquartile mean over all seeds and tasks.
+
+    Every task is a stratum: its seeds are drawn anew, with replacement, apart from
+    those of the other tasks.
+
+    Args:
+        scores: `[seeds, tasks]`.
+        level: how probable the interval is to hold the value.
+        resamples: how often all is drawn.
+        seed: of the drawing: the same scores always give the same interval.
+
+    Returns:
+        Its two ends; None for fewer than two seeds, which say nothing of the spread.
+    """
+    scores = np.asarray(scores, np.float64)
+    if len(scores) < 2:
+        return None
+
+    def statistic(*tasks: Scores, axis: int) -> Scores:
+        # scipy resamples along the last axis, whatever stands before it.
+        return interquartile_mean(np.concatenate(tasks, axis=axis))
+
+    interval = stats.bootstrap(
+        tuple(scores.T),
+        statistic,
+        vectorized=True,
+        n_resamples=resamples,
+        confidence_level=level,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)

@@ -36,6 +36,8 @@ class RunData:
         episode_length: steps to the time limit.
         curve: per stage, interactions within the task `[points]` and what the training
             reward a step makes in a whole episode, `[S, points]`; NaN where missing.
+        hours: wall clock of training in all seeds together, with compilation, without
+            selection and evaluation.
         rate: training interactions of all seeds per second, without the chunks that
             compiled; None where there is no other chunk.
     """
@@ -54,6 +56,7 @@ class RunData:
     selection: int
     episode_length: int
     curve: tuple[tuple[Array, Array], ...]
+    hours: float
     rate: float | None
 
     @property
@@ -97,6 +100,7 @@ def read_run(folder: str | Path) -> RunData:
     finished = int(np.cumprod(whole)[1:].sum())
     spent = [row["interactions"] for row in results.values()]
     began = finished > 0
+    hours, rate = _times(folder / "timing.jsonl", len(tasks), len(seeds), began)
     return RunData(
         folder=folder,
         settings=settings,
@@ -115,7 +119,8 @@ def read_run(folder: str | Path) -> RunData:
         curve=_curve(
             folder / "training.jsonl", len(tasks), place, began, episode_length
         ),
-        rate=_rate(folder / "timing.jsonl", len(tasks), len(seeds), began),
+        hours=hours,
+        rate=rate,
     )
 
 
@@ -168,22 +173,27 @@ def _curve(
     return tuple(curve)
 
 
-def _rate(path: Path, tasks: int, seeds: int, began: bool) -> float | None:
-    """Training interactions of all seeds per second, see `RunData.rate`."""
+def _times(
+    path: Path, tasks: int, seeds: int, began: bool
+) -> tuple[float, float | None]:
+    """Hours and rate, see `RunData`."""
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[float, bool]]:
         at = _index(row, "stage", 0, tasks), int(row["interactions"])
-        return at, (float(row["seconds"]), bool(row["compile"]))
+        # Updates after a task's last interaction have reports of their own.
+        key = (*at, int(row.get("polishing", 0)))
+        return key, (float(row["seconds"]), bool(row["compile"]))
 
     interactions, seconds, last = 0, 0.0, (0, 0)
     rows = _table(path, parse, needed=began)
-    for (stage, x), (took, compiled) in sorted(rows.items()):
+    for (stage, x, _), (took, compiled) in sorted(rows.items()):
         if not compiled:
             # Rows count from the task's start: a chunk is what came on top.
             interactions += x - (last[1] if last[0] == stage else 0)
             seconds += took
         last = (stage, x)
-    return seeds * interactions / seconds if seconds > 0 else None
+    hours = sum(took for took, _ in rows.values()) / 3600
+    return hours, seeds * interactions / seconds if seconds > 0 else None
 
 
 def _table(

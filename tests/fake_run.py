@@ -1,6 +1,7 @@
 """Writes run folders with known numbers, for the tests of what reads them."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ def write_run(
     seeds: int = 2,
     stages: int = 3,
     diverged: tuple[int, ...] = (),
+    tasks: Sequence[str] = TASKS,
+    scores: np.ndarray = SCORES,
+    size: float = 1.5,
     **settings: Any,
 ) -> Path:
     """A run folder with `stages` tasks trained."""
@@ -36,7 +40,7 @@ def write_run(
             "interactions": BUDGET,
             **settings,
         },
-        "tasks": TASKS,
+        "tasks": tasks,
         "episode_length": 10,
         "model_size": {"numbers": 9, "ratio": 2.11},
         "provenance": {
@@ -52,18 +56,18 @@ def write_run(
         {
             "stage": stage,
             "task": task,
-            "name": TASKS[task],
+            "name": tasks[task],
             "seed": seed,
             "return": float("nan")
             if seed in diverged
-            else float(SCORES[stage + 1, task] + GAP * seed),
+            else float(scores[stage + 1, task] + GAP * seed),
             "episodes": 10,
             "interactions": {"training": BUDGET * (stage + 1), "selection": 77},
             "diverged": seed in diverged and stage >= 0,
-            "model_size": 1.5 + 0.25 * (stage + 1),
+            "model_size": size + 0.25 * (stage + 1),
         }
         for stage in range(-1, stages)
-        for task in range(len(TASKS))
+        for task in range(len(tasks))
         for seed in range(seeds)
     ]
     chunks = [(stage, x) for stage in range(stages) for x in (250, 500, 1000)]

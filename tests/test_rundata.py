@@ -60,3 +60,22 @@ def test_rewritten_rows_replace_earlier_ones(tmp_path: Path) -> None:
     again = read_run(run)
     np.testing.assert_array_equal(again.scores, whole.scores)
     assert again.rate == whole.rate
+
+
+def test_hours_and_rate_count_updates_after_the_last_interaction(
+    tmp_path: Path,
+) -> None:
+    run = write_run(tmp_path / "run")
+    # Three tasks of 60 s while compiling, then 1 s and 2 s for 750 interactions.
+    data = read_run(run)
+    assert data.hours == pytest.approx(3 * 63 / 3600)
+    assert data.rate == pytest.approx(2 * 3 * 750 / 9)
+    with (run / "timing.jsonl").open("a") as file:
+        for polishing, seconds in ((10, 4), (20, 5)):
+            file.write(
+                f'{{"stage": 2, "interactions": 1000, "polishing": {polishing}, '
+                f'"seconds": {seconds}, "compile": false}}\n'
+            )
+    data = read_run(run)
+    assert data.hours == pytest.approx((3 * 63 + 9) / 3600)
+    assert data.rate == pytest.approx(2 * 3 * 750 / 18)
