@@ -58,10 +58,10 @@ def test_the_readmes_own_scenario_and_method_work(tmp_path: Path) -> None:
     blocks = re.findall(
         r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
     )
-    exec(next(block for block in blocks if "def near" in block), {})
+    exec(next(block for block in blocks if "def shrink" in block), {})
     try:
         scenario = rewire_jax.make_scenario("probe/reach")
-        settings = rewire_jax.preset(scenario, "near", "quick")
+        settings = rewire_jax.preset(scenario, "shrink", "quick")
         settings = dataclasses.replace(
             settings,
             interactions=320,
@@ -76,4 +76,4 @@ def test_the_readmes_own_scenario_and_method_work(tmp_path: Path) -> None:
         policy = rewire_jax.load_policy(tmp_path / "run", task=1)
         assert policy(jnp.zeros(2)).shape == (2,)
     finally:
-        del methods.METHODS["near"]
+        del methods.METHODS["shrink"]
