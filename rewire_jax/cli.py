@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import tyro
 
-from rewire_jax import continual, inspection
+from rewire_jax import continual, inspection, report
 from rewire_jax.config import Settings, require
 from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS
@@ -57,6 +57,19 @@ class Evaluate:
     episodes: int = 128
     seed: int = 0
     json: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Report:
+    """Tables and pictures of runs on the same scenario, from their files alone.
+
+    Attributes:
+      runs: folders of the runs, finished or not; a SAC-N run normalises the others.
+      out: folder for the report; an earlier report there is replaced.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    out: Path = Path("report")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,6 +168,11 @@ def _evaluate(arguments: Sequence[str]) -> None:
         )
 
 
+def _report(arguments: Sequence[str]) -> None:
+    asked = parse(Report, "report", arguments)
+    print(report.to_terminal(report.write_report(asked.runs, asked.out)), end="")
+
+
 def _info(arguments: Sequence[str]) -> None:
     asked = parse(Info, "info", arguments)
     facts = inspection.info(make_scenario(asked.scenario, asked.backend))
@@ -183,13 +201,20 @@ def _list(arguments: Sequence[str]) -> None:
         print(f"{title}:", *entries, sep="\n  ")
 
 
-_COMMANDS = {"train": _train, "evaluate": _evaluate, "info": _info, "list": _list}
+_COMMANDS = {
+    "train": _train,
+    "evaluate": _evaluate,
+    "report": _report,
+    "info": _info,
+    "list": _list,
+}
 _USAGE = """usage: rewire-jax COMMAND ...
 
   train SCENARIO --out RUN [--method M] [--profile P] [--resume] [--SETTING VALUE ...]
       learn the tasks of a scenario, one after the other
       (`rewire-jax train SCENARIO --help` lists all settings and their values)
   evaluate RUN    play the tasks of a run with what it has learned
+  report RUN...   tables and pictures of runs, side by side
   info SCENARIO   tasks, budgets, backend, and the model size of each method
   list            scenarios and methods
 

@@ -18,9 +18,19 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's palette, told apart with any colour vision; yellow is left out as too
-# pale for a line on white. Beyond its length the line style changes too.
-_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
+# Okabe and Ito's palette, told apart with any colour vision; for its yellow, too pale
+# for a line on white, come Tol's wine and grey. Beyond nine the line style changes too.
+_COLOURS = (
+    "#0072B2",
+    "#009E73",
+    "#CC79A7",
+    "#000000",
+    "#56B4E9",
+    "#E69F00",
+    "#882255",
+    "#808080",
+    "#D55E00",
+)
 _STYLES = ("-", "--", ":")
 
 
@@ -73,9 +83,9 @@ def curves(
         title: above the picture.
         path: the PNG file to write.
     """
-    figure, (axes,) = _figure((max(8.0, 1.5 * len(tasks)), 5.2), 1, 1)
+    figure, (axes,) = empty((max(9.0, 1.6 * len(tasks)), 5.2), 1, 1)
     for i, line in enumerate(lines):
-        _draw_curve(axes, i, line, budget, alpha=0.36 / max(2, len(lines)))
+        _draw_curve(axes, i, line, budget, alpha=max(0.09, 0.36 / max(2, len(lines))))
     for k, name in enumerate(tasks):
         axes.axvline(k * budget, color="0.6", linewidth=0.8, zorder=0)
         # One word a line: eight long names fit side by side.
@@ -98,19 +108,9 @@ def curves(
     axes.set_ylabel("return")
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
-    shared: dict[str, Any] = {"color": "0.3", "linestyle": "none", "markersize": 7}
-    key = [
-        Line2D([], [], **_look(i), label=line.label) for i, line in enumerate(lines)
-    ] + [
-        Line2D(
-            [], [], marker="o", fillstyle="none", label="evaluated before", **shared
-        ),
-        Line2D([], [], marker="o", label="evaluated right after", **shared),
-    ]
-    figure.legend(
-        handles=key, loc="outside lower center", ncols=min(len(key), 6), frameon=False
-    )
-    _entitle(
+    key = [Line2D([], [], **look(i), label=line.label) for i, line in enumerate(lines)]
+    figure.legend(handles=key, loc="outside right upper", frameon=False)
+    entitle(
         figure,
         title,
         "lines: training reward a step × steps of an episode, mean over seeds, "
@@ -137,12 +137,12 @@ def matrices(
     low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
     # Equal ends would give a scale without extent.
     scale = Normalize(low, high if high > low else low + 1)
-    columns = min(2, len(lines))
+    columns = int(np.ceil(np.sqrt(len(lines))))
     rows = -(-len(lines) // columns)
     count = len(tasks)
-    width = max(7.0, columns * (2.0 + 0.62 * (count + 1)) + 1)
-    height = rows * (1.2 + 0.42 * count) + 1
-    figure, panels = _figure((width, height), rows, columns)
+    width = max(7.0, columns * (0.4 + 0.58 * (count + 1)) + 2.5)
+    height = rows * (1.0 + 0.4 * count) + 1
+    figure, panels = empty((width, height), rows, columns)
     # All cells of a picture have as many decimals as the largest needs.
     size = max(abs(low), abs(high))
     names = [f"{k + 1} {name}" for k, name in enumerate(tasks)]
@@ -150,9 +150,10 @@ def matrices(
     for axes, line, cells in zip(panels, lines, maps, strict=False):
         image = axes.imshow(cells, cmap="cividis", norm=scale, aspect="auto")
         axes.set_title(line.label, fontsize=12)
-        axes.set_yticks(range(count), names)
+        first = axes.get_subplotspec().is_first_col()  # type: ignore[union-attr]
+        axes.set_yticks(range(count), names if first else [])
         axes.set_xticks(range(count + 1), ["before", *map(str, range(1, count + 1))])
-        axes.set_ylabel("evaluated on")
+        axes.set_ylabel("evaluated on" if first else "")
         axes.set_xlabel("after training on task")
         axes.tick_params(length=0, labelsize=9)
         for (task, stage), value in np.ndenumerate(cells):
@@ -187,11 +188,11 @@ def matrices(
         figure.colorbar(
             image, ax=panels, label="return, mean over seeds", aspect=20 * rows
         )
-    _entitle(figure, title, "framed: right after own training")
+    entitle(figure, title, "framed: right after own training")
     figure.savefig(path)
 
 
-def _figure(
+def empty(
     size: tuple[float, float], rows: int, columns: int
 ) -> tuple[Figure, list[Axes]]:
     """A figure of its own: `pyplot` would keep state between calls."""
@@ -200,54 +201,31 @@ def _figure(
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
-def _entitle(figure: Figure, title: str, reading: str) -> None:
+def entitle(figure: Figure, title: str, reading: str) -> None:
+    """Puts a title above a figure, and how to read it."""
     width = int(11 * figure.get_figwidth())
     lines = [*textwrap.wrap(title, width), *textwrap.wrap(reading, width)]
     figure.suptitle("\n".join(lines), fontsize=11)
 
 
-def _look(i: int) -> dict[str, Any]:
+def look(i: int) -> dict[str, Any]:
+    """Colour and line style of the method at a place, the same in all pictures."""
     style = _STYLES[i // len(_COLOURS) % len(_STYLES)]
     return {"color": _COLOURS[i % len(_COLOURS)], "linestyle": style}
 
 
 def _draw_curve(axes: Axes, i: int, line: Line, budget: int, alpha: float) -> None:
-    """A method's curve, a piece for each task, and its evaluations at the borders."""
-    look = _look(i)
-    colour = look["color"]
-    scores = mean(line.scores)
+    """A method's curve, a piece for each task."""
     for stage, (x, returns) in enumerate(line.curve):
         middle = mean(returns)
         there = ~np.isnan(middle)
         x = x[there] + stage * budget
-        if x.size:
-            low = np.nanmin(returns[:, there], axis=0)
-            high = np.nanmax(returns[:, there], axis=0)
-            axes.fill_between(x, low, high, color=colour, alpha=alpha, linewidth=0)
-            # A single point makes no line: its marker shows it.
-            marker = "." if x.size == 1 else ""
-            axes.plot(
-                x,
-                middle[there],
-                color=colour,
-                linestyle=look["linestyle"],
-                linewidth=1.8,
-                marker=marker,
-            )
-        # Beside the border, and beside the other methods' markers.
-        inset = (0.02 + 0.025 * i) * budget
-        ends = (
-            (stage * budget + inset, stage, "none"),
-            ((stage + 1) * budget - inset, stage + 1, "full"),
-        )
-        for at, row, fill in ends:
-            axes.plot(
-                at,
-                scores[row, stage],
-                color=colour,
-                marker="o",
-                markersize=6,
-                fillstyle=fill,
-                linestyle="none",
-                zorder=3,
-            )
+        if not x.size:
+            continue
+        low = np.nanmin(returns[:, there], axis=0)
+        high = np.nanmax(returns[:, there], axis=0)
+        colour = look(i)["color"]
+        axes.fill_between(x, low, high, color=colour, alpha=alpha, linewidth=0)
+        # A single point makes no line: its marker shows it.
+        marker = "." if x.size == 1 else ""
+        axes.plot(x, middle[there], **look(i), linewidth=1.6, marker=marker)

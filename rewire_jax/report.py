@@ -17,16 +17,29 @@ from rich.text import Text
 from rewire_jax import figures, tables
 from rewire_jax.errors import UserError
 from rewire_jax.rundata import RunData, read_run
-from rewire_jax.summary import MEASURES, Summary, summarize
+from rewire_jax.scatter import Point, tradeoff
+from rewire_jax.scenarios import SCENARIOS
+from rewire_jax.summary import MEASURES, Comparison, Summary, summarize
 
 __all__ = ["Report", "RunData", "read_run", "to_terminal", "write_report"]
 
 _READING = (
-    "Returns are deterministic evaluations: mean ± sample standard deviation over "
-    "seeds. Forgetting is the return at the end minus the return right after own "
-    "training: negative means forgotten. Performance is the return at the end averaged "
-    "over tasks. Interactions (training, selection) are for each seed; interactions/s "
-    "is training in all seeds together, without chunks that compiled."
+    "Returns are deterministic evaluations. Performance is the score at the end, "
+    "averaged over tasks; values are mean ± sample standard deviation over seeds. IQM "
+    "is the interquartile mean of the tasks' scores at the end over all seeds, with "
+    "its stratified bootstrap interval. Forgetting is the score at the end minus the "
+    "score right after own training: negative means forgotten. Training and selection "
+    "are interactions of each seed; hours are those of training. Forgetting of single "
+    "tasks is in returns."
+)
+_NORMALISED = (
+    "÷ SAC-N: performance, IQM, forgetting and transfer are divided by the mean return "
+    "of SAC-N at the end, averaged over tasks and seeds. Forward transfer is the score "
+    "right after own training minus that of SAC-N."
+)
+_PAPER = (
+    "The paper's columns are its published results, over SAC-N's on Brax v1: the "
+    "physics here is another."
 )
 
 
@@ -36,28 +49,38 @@ class Report:
 
     Attributes:
         title: scenario, profile, budget, backend, seeds.
-        notes: what a reader must know: diverged seeds, unfinished runs.
-        summaries: the numbers, one entry for each run.
+        notes: what a reader must know: raw returns, diverged seeds, unfinished runs.
+        comparison: the numbers.
         markdown: the tables for people.
-        csv: the same numbers, one a row.
+        csv: a row for each run, in the form of the paper's Table 1.
+        tasks: a row for each run and task.
         json: the numbers by seed, with every run's settings and provenance.
         curves: picture of training over the sequence.
         matrix: picture of task × stage.
+        tradeoff: picture of performance and model size, the paper's Fig. 4.
     """
 
     title: str
     notes: tuple[str, ...]
-    summaries: tuple[Summary, ...]
+    comparison: Comparison
     markdown: Path
     csv: Path
+    tasks: Path
     json: Path
     curves: Path
     matrix: Path
+    tradeoff: Path
+
+    @property
+    def summaries(self) -> tuple[Summary, ...]:
+        """The numbers, one entry for each run."""
+        return self.comparison.summaries
 
     @property
     def paths(self) -> tuple[Path, ...]:
         """All files of the report."""
-        return self.markdown, self.csv, self.json, self.curves, self.matrix
+        data = self.markdown, self.csv, self.tasks, self.json
+        return *data, self.curves, self.matrix, self.tradeoff
 
 
 def write_report(runs: Sequence[str | Path], out: str | Path) -> Report:
@@ -71,28 +94,33 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Report:
         UserError: a run cannot be read, the runs are not comparable, or `out` cannot
             be written.
     """
-    summaries = summarize([read_run(run) for run in runs])
+    comparison = summarize([read_run(run) for run in runs])
     out = Path(out)
     report = Report(
-        title=_title(summaries),
-        notes=tuple(_notes(summaries)),
-        summaries=summaries,
+        title=_title(comparison.summaries),
+        notes=tuple(_notes(comparison)),
+        comparison=comparison,
         markdown=out / "report.md",
         csv=out / "report.csv",
+        tasks=out / "tasks.csv",
         json=out / "result.json",
         curves=out / "curves.png",
         matrix=out / "matrix.png",
+        tradeoff=out / "tradeoff.png",
     )
-    first = summaries[0].run
-    lines = [_line(summary) for summary in summaries]
+    first, title = report.summaries[0].run, report.title
     budget = int(first.settings["interactions"])
+    lines = [_line(summary) for summary in report.summaries]
     try:
         out.mkdir(parents=True, exist_ok=True)
         report.markdown.write_text(_markdown(report), encoding="utf-8")
-        report.csv.write_text(tables.csv_text(summaries), encoding="utf-8")
+        report.csv.write_text(tables.results_csv(comparison), encoding="utf-8")
+        report.tasks.write_text(tables.tasks_csv(comparison), encoding="utf-8")
         report.json.write_text(_json(report), encoding="utf-8")
-        figures.curves(lines, first.tasks, budget, report.title, report.curves)
-        figures.matrices(lines, first.tasks, report.title, report.matrix)
+        figures.curves(lines, first.tasks, budget, title, report.curves)
+        figures.matrices(lines, first.tasks, title, report.matrix)
+        points = [_point(summary) for summary in report.summaries]
+        tradeoff(points, comparison.unit, title, report.tradeoff)
     except OSError as error:
         raise UserError(f"cannot write {error.filename}: {error.strerror}") from None
     return report
@@ -108,7 +136,9 @@ def to_terminal(report: Report, width: int = 100) -> str:
     file = io.StringIO()
     console = Console(file=file, width=width, color_system=None, force_terminal=False)
     console.print(Text(report.title))
-    for heads, rows in _tables(report.summaries):
+    # A terminal shows the end best, and is too narrow for all columns side by side.
+    for make in (tables.tasks, tables.costs, tables.results):
+        heads, rows = make(report.comparison)
         table = Table(
             box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True
         )
@@ -127,7 +157,7 @@ def to_terminal(report: Report, width: int = 100) -> str:
         console.print()
         console.print(table)
     console.print()
-    for note in (_READING, *report.notes):
+    for note in (*_reading(report.comparison), *report.notes):
         console.print(Text(note))
     console.print()
     for path in report.paths:
@@ -136,23 +166,24 @@ def to_terminal(report: Report, width: int = 100) -> str:
     return file.getvalue()
 
 
-def _tables(
-    summaries: Sequence[Summary],
-) -> tuple[tuple[tuple[str, ...], list[list[str]]], ...]:
-    """Headings and rows, the tasks first: a terminal shows the end best."""
-    return (
-        (tables.TASK_HEADS, tables.task_rows(summaries)),
-        (tables.OVERALL_HEADS, tables.overall_rows(summaries)),
-    )
+def _reading(comparison: Comparison) -> Iterator[str]:
+    yield _READING
+    if not comparison.raw:
+        yield _NORMALISED
+    if comparison.sources:
+        yield _PAPER
 
 
 def _title(summaries: Sequence[Summary]) -> str:
     settings = summaries[0].run.settings
     budget, paper = int(settings["interactions"]), settings.get("paper_interactions")
+    spec, tasks = SCENARIOS.get(settings["scenario"]), len(summaries[0].run.tasks)
+    whole = len(spec.changes) * spec.repeats if spec else tasks
     counts = sorted({len(summary.run.seeds) for summary in summaries})
     seeds = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
     parts = [
         f"{settings['scenario']}: {settings['profile']} profile",
+        f"{tasks} of {whole} tasks" if tasks < whole else f"{tasks} tasks",
         f"{budget:,} interactions a task",
         f"{settings['backend']} backend",
         f"{seeds} seed{'' if counts[-1] == 1 else 's'}",
@@ -164,8 +195,10 @@ def _title(summaries: Sequence[Summary]) -> str:
     return ", ".join(parts)
 
 
-def _notes(summaries: Sequence[Summary]) -> Iterator[str]:
-    for summary in summaries:
+def _notes(comparison: Comparison) -> Iterator[str]:
+    if comparison.raw:
+        yield f"Scores are raw returns, not normalised: {comparison.raw}."
+    for summary in comparison.summaries:
         run = summary.run
         if run.diverged:
             names = ", ".join(str(seed) for seed in run.diverged)
@@ -191,16 +224,31 @@ def _line(summary: Summary) -> figures.Line:
     return figures.Line(summary.label, curve, scores[kept])
 
 
+def _point(summary: Summary) -> Point:
+    value = summary.performance
+    mean = math.nan if value.mean is None else value.mean
+    return Point(summary.label, summary.run.model_size, mean, value.std)
+
+
 def _markdown(report: Report) -> str:
-    lines = [f"# {report.title}", "", _READING, ""]
+    comparison = report.comparison
+    lines = [f"# {report.title}", ""]
     for note in report.notes:
         lines += [f"**{note}**", ""]
-    for heads, rows in _tables(report.summaries):
-        rule = ["---" if head in tables.WORDS else "---:" for head in heads]
-        lines += [f"| {' | '.join(row)} |" for row in (heads, rule, *rows)]
-        lines.append("")
-    for name, path in (("Learning curves", report.curves), ("Matrix", report.matrix)):
+    results, costs = tables.results(comparison), tables.costs(comparison)
+    lines += _rows(
+        results.heads + costs.heads[1:],
+        [row + more[1:] for row, more in zip(results.rows, costs.rows, strict=True)],
+    )
+    for note in _reading(comparison):
+        lines += [note, ""]
+    for name, path in (
+        ("Performance and model size", report.tradeoff),
+        ("Learning curves", report.curves),
+        ("Matrix", report.matrix),
+    ):
         lines += [f"![{name}]({path.name})", ""]
+    lines += _rows(*tables.tasks(comparison))
     for summary in report.summaries:
         run, made = summary.run, summary.run.provenance
         seeds = ", ".join(str(seed) for seed in run.seeds)
@@ -209,6 +257,11 @@ def _markdown(report: Report) -> str:
             f"- {summary.label}: `{run.folder}`, seeds {seeds}, {', '.join(facts)}"
         )
     return "\n".join(lines) + "\n"
+
+
+def _rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    rule = ["---" if head in tables.WORDS else "---:" for head in heads]
+    return [*(f"| {' | '.join(row)} |" for row in (heads, rule, *rows)), ""]
 
 
 def _json(report: Report) -> str:
@@ -220,7 +273,7 @@ def _json(report: Report) -> str:
             "budget": summary.run.settings["interactions"],
             "complete": summary.run.complete,
             "finished_tasks": summary.run.finished,
-            "seeds": summary.run.seeds,
+            "all_seeds": summary.run.seeds,
             "diverged": summary.run.diverged,
             # The seeds whose `values` stand below, in their order.
             "kept": np.array(summary.run.seeds)[summary.run.kept].tolist(),
@@ -228,15 +281,31 @@ def _json(report: Report) -> str:
                 {"name": name, **{key: asdict(value) for key, value in task.items()}}
                 for name, task in zip(summary.run.tasks, summary.tasks, strict=True)
             ],
+            "scores": summary.run.scores[summary.run.kept].tolist(),
             "performance": asdict(summary.performance),
+            "iqm": asdict(summary.iqm),
             "mean_forgetting": asdict(summary.forgetting),
-            **tables.run_values(summary.run),
+            "forward_transfer": asdict(summary.transfer),
+            **tables.run_values(summary),
+            "published": [
+                theirs
+                and {"table": source.table, "of": source.name, **theirs._asdict()}
+                for source, theirs in zip(
+                    report.comparison.sources, summary.published, strict=True
+                )
+            ],
             "settings": summary.run.settings,
             "provenance": summary.run.provenance,
         }
         for summary in report.summaries
     ]
-    data = {"format": 1, "title": report.title, "notes": report.notes, "runs": runs}
+    data = {
+        "format": 2,
+        "title": report.title,
+        "notes": report.notes,
+        "unit": report.comparison.unit,
+        "runs": runs,
+    }
     return json.dumps(_without_nan(data), indent=1, allow_nan=False) + "\n"
 
 

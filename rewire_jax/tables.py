@@ -2,97 +2,180 @@
 
 import csv
 import io
-import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from rewire_jax.figures import number
-from rewire_jax.rundata import RunData
-from rewire_jax.summary import MEASURES, Spread, Summary
+from rewire_jax.published import Figures
+from rewire_jax.summary import MEASURES, Comparison, Interval, Spread, Summary
 
-# Headings of `task_rows` and `overall_rows`; columns of words are set to the left.
-TASK_HEADS = ("method", "task", *MEASURES.values())
-OVERALL_HEADS = (
-    "method",
-    "seeds",
-    "performance",
-    "mean forgetting",
-    "model size",
-    "training",
-    "selection",
-    "interactions/s",
-    "device",
-)
+# Columns of words are set to the left, all others to the right.
 WORDS = frozenset(("method", "task", "seeds", "device"))
 
 
-def _text(value: Spread) -> str:
+class Table(NamedTuple):
+    """Headings, and rows as long; the first column names the run."""
+
+    heads: tuple[str, ...]
+    rows: list[list[str]]
+
+
+def tasks(comparison: Comparison) -> Table:
+    """A row for each run and task, of returns; tasks count from 1."""
+    rows = [
+        [summary.label, f"{k} {name}", *map(_spread, task.values())]
+        for summary in comparison.summaries
+        for k, (name, task) in enumerate(
+            zip(summary.run.tasks, summary.tasks, strict=True), 1
+        )
+    ]
+    return Table(("method", "task", *MEASURES.values()), rows)
+
+
+def results(comparison: Comparison) -> Table:
+    """A row for each run in the form of the paper's Table 1, the paper's beside it."""
+    heads = [
+        "method",
+        f"performance ({comparison.unit})",
+        "IQM [95% interval]",
+        "model size",
+    ]
+    for source in comparison.sources:
+        heads.append(f"paper's {source.table}, {source.name} (÷ SAC-N)")
+        if source.sized:
+            heads.append("its model size")
+    rows = []
+    for summary in comparison.summaries:
+        row = [
+            summary.label,
+            _spread(summary.performance),
+            _interval(summary.iqm),
+            f"{summary.run.model_size:.2f}",
+        ]
+        for source, theirs in zip(comparison.sources, summary.published, strict=True):
+            row.append(f"{theirs.mean:.2f} ± {theirs.std:.2f}" if theirs else "–")
+            if source.sized:
+                row.append(f"{theirs.size:.1f}" if theirs and theirs.size else "–")
+        rows.append(row)
+    return Table(tuple(heads), rows)
+
+
+def costs(comparison: Comparison) -> Table:
+    """A row for each run: what was forgotten, what was of use, what it took."""
+    rows = [
+        [
+            summary.label,
+            _spread(summary.forgetting),
+            _spread(summary.transfer),
+            f"{summary.run.training:,}",
+            f"{summary.run.selection:,}",
+            number(summary.run.hours),
+            _seeds(summary),
+            str(summary.run.provenance.get("device", "–")),
+        ]
+        for summary in comparison.summaries
+    ]
+    heads = (
+        "method",
+        "forgetting",
+        "forward transfer",
+        "training",
+        "selection",
+        "hours, all seeds together",
+        "seeds",
+        "device",
+    )
+    return Table(heads, rows)
+
+
+def results_csv(comparison: Comparison) -> str:
+    """CSV with a row a run and a column a number."""
+    return _csv(
+        [
+            {"method": summary.label, "unit": comparison.unit}
+            | _columns("performance", summary.performance)
+            | {
+                "iqm": summary.iqm.value,
+                "iqm_low": summary.iqm.low,
+                "iqm_high": summary.iqm.high,
+            }
+            | _columns("forgetting", summary.forgetting)
+            | _columns("forward_transfer", summary.transfer)
+            | run_values(summary)
+            | {
+                f"paper_{source.key}_{key}": getattr(theirs, key, None)
+                for source, theirs in zip(
+                    comparison.sources, summary.published, strict=True
+                )
+                for key in Figures._fields
+                if key != "size" or source.sized
+            }
+            for summary in comparison.summaries
+        ]
+    )
+
+
+def tasks_csv(comparison: Comparison) -> str:
+    """CSV with a row for each run and task, of returns; tasks count from 1."""
+    return _csv(
+        [
+            {"method": summary.label, "task": k, "name": name}
+            | {
+                column: value
+                for measure, spread in task.items()
+                for column, value in _columns(measure, spread).items()
+            }
+            for summary in comparison.summaries
+            for k, (name, task) in enumerate(
+                zip(summary.run.tasks, summary.tasks, strict=True), 1
+            )
+        ]
+    )
+
+
+def run_values(summary: Summary) -> dict[str, Any]:
+    """The values that a run has once and not for each seed."""
+    run = summary.run
+    return {
+        "model_size": run.model_size,
+        "training_interactions": run.training,
+        "selection_interactions": run.selection,
+        "hours_all_seeds": run.hours,
+        "interactions_per_second": run.rate,
+        "seeds": int(run.kept.sum()),
+        "diverged_seeds": len(run.diverged),
+        "device": run.provenance.get("device"),
+    }
+
+
+def _csv(rows: Sequence[dict[str, Any]]) -> str:
+    file = io.StringIO()
+    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
+
+
+def _columns(name: str, value: Spread) -> dict[str, Any]:
+    return {f"{name}_mean": value.mean, f"{name}_std": value.std}
+
+
+def _spread(value: Spread) -> str:
     if value.mean is None or value.std is None:
         return number(value.mean)
     scale = max(abs(value.mean), value.std)
     return f"{number(value.mean, scale)} ± {number(value.std, scale)}"
 
 
-def task_rows(summaries: Sequence[Summary]) -> list[list[str]]:
-    """A row for each run and task, under `TASK_HEADS`; tasks count from 1."""
-    return [
-        [summary.label, f"{k} {name}", *map(_text, task.values())]
-        for summary in summaries
-        for k, (name, task) in enumerate(
-            zip(summary.run.tasks, summary.tasks, strict=True), 1
-        )
-    ]
+def _interval(value: Interval) -> str:
+    if value.low is None or value.high is None:
+        return number(value.value)
+    scale = max(abs(value.low), abs(value.high))
+    ends = f"[{number(value.low, scale)}, {number(value.high, scale)}]"
+    return f"{number(value.value, scale)} {ends}"
 
 
-def overall_rows(summaries: Sequence[Summary]) -> list[list[str]]:
-    """A row for each run, under `OVERALL_HEADS`."""
-    rows = []
-    for summary in summaries:
-        run = summary.run
-        count = len(run.seeds)
-        seeds = f"{run.kept.sum()} of {count}" if run.diverged else str(count)
-        rows.append(
-            [
-                summary.label,
-                seeds,
-                _text(summary.performance),
-                _text(summary.forgetting),
-                f"{run.model_size:.2f}",
-                f"{run.training:,}",
-                f"{run.selection:,}",
-                number(run.rate),
-                str(run.provenance.get("device", "–")),
-            ]
-        )
-    return rows
-
-
-def csv_text(summaries: Sequence[Summary]) -> str:
-    """CSV with one value a row; `task` counts from 0 and is empty for a whole run."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(("method", "task", "name", "measure", "seeds", "mean", "std"))
-    for summary in summaries:
-        values: list[tuple[int | str, str, str, Spread]] = [
-            (k, name, measure, value)
-            for k, name in enumerate(summary.run.tasks)
-            for measure, value in summary.tasks[k].items()
-        ]
-        values.append(("", "", "performance", summary.performance))
-        values.append(("", "", "mean_forgetting", summary.forgetting))
-        for *cells, value in values:
-            seeds = sum(not math.isnan(x) for x in value.values)
-            writer.writerow((summary.label, *cells, seeds, value.mean, value.std))
-        seeds = len(summary.run.seeds)
-        for measure, single in run_values(summary.run).items():
-            writer.writerow((summary.label, "", "", measure, seeds, single, None))
-    return file.getvalue()
-
-
-def run_values(run: RunData) -> dict[str, float | None]:
-    """The values that a run has once and not for each seed."""
-    return {
-        "model_size": run.model_size,
-        "training_interactions": run.training,
-        "selection_interactions": run.selection,
-        "interactions_per_second": run.rate,
-    }
+def _seeds(summary: Summary) -> str:
+    run = summary.run
+    count = len(run.seeds)
+    return f"{run.kept.sum()} of {count}" if run.diverged else str(count)

@@ -132,6 +132,30 @@ def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"{row['return']:.1f}" in capsys.readouterr().out
 
 
+def test_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    out = tmp_path / "report"
+    cli.main(["report", str(run), "--out", str(out)])
+    shown = capsys.readouterr().out
+    assert "Scores are raw returns" in shown
+    assert "FT-1" in shown
+    for name in ("report.md", "report.csv", "result.json", "tradeoff.png"):
+        assert (out / name).stat().st_size > 0
+        assert str(out / name) in shown
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_reports_that_cannot_be(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "name the folder" in fails(capsys, "report")
+    assert "given twice" in fails(capsys, "report", run, run)
+    assert "not the folder of a run" in fails(capsys, "report", tmp_path)
+    assert "--oot" in fails(capsys, "report", run, "--oot", tmp_path)
+    (tmp_path / "file").touch()
+    assert "cannot write" in fails(capsys, "report", run, "--out", tmp_path / "file")
+
+
 def test_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
     cli.main(["list", "--json"])
     names = json.loads(capsys.readouterr().out)

@@ -7,17 +7,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_run import BUDGET, write_run
+from fake_run import BUDGET, SCORES, write_run
 from matplotlib.image import imread
 
 from rewire_jax.errors import UserError
-from rewire_jax.report import read_run, to_terminal, write_report
+from rewire_jax.report import Report, read_run, to_terminal, write_report
+
+METHODS = ("rewire", "ft1", "sac_n")
+RAW = "Scores are raw returns, not normalised: there is no SAC-N run among them"
 
 
-def cell(rows: list[dict[str, str]], measure: str, task: str = "") -> dict[str, str]:
-    found = [r for r in rows if r["measure"] == measure and r["task"] == task]
-    assert len(found) == 1
-    return found[0]
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def cells(report: Report, label: str) -> dict[str, str]:
+    """A run's row of the first table of the Markdown, by heading."""
+    table = report.markdown.read_text().split("\n\n| ")[1].splitlines()
+    split = [line.strip("| ").split(" | ") for line in table]
+    (found,) = [row for row in split if row[0] == label]
+    return dict(zip(split[0], found, strict=True))
 
 
 def test_known_numbers_everywhere(tmp_path: Path) -> None:
@@ -27,29 +37,126 @@ def test_known_numbers_everywhere(tmp_path: Path) -> None:
     # Means over the seeds are 100 above seed 0; two values 200 apart: std 141.42.
     text = report.markdown.read_text()
     assert (
-        "| rewire | 1 hugefoot | 101 ± 141 | 1,100 ± 141 | 500 ± 141 | -600 ± 0 |"
+        "| Ours (rewire) | 1 hugefoot | 101 ± 141 | 1,100 ± 141 | 500 ± 141 | -600 ± 0 "
     ) in text
-    assert "| rewire | 3 carry_stuff | 103 ± 141 | 3,100 ± 141 | 3,100 ± 141 | 0.00"
+    assert "| 3 carry_stuff | 103 ± 141 | 3,100 ± 141 | 3,100 ± 141 | 0.00" in text
     end = (400 + 1500 + 3000) / 3 + 100
-    assert f"| rewire | 2 | {end:,.0f} ± 141 | -367 ± 0 | 2.25 | 3,000 | 77 |" in text
+    row = cells(report, "Ours (rewire)")
+    assert row["performance (raw return)"] == f"{end:,.0f} ± 141"
+    # Of 400, 600, 1500, 1700, 3000, 3200 the middle four.
+    assert row["IQM [95% interval]"].startswith("1,700 [")
+    assert row["forgetting"] == "-367 ± 0"
+    assert row["forward transfer"] == "–"
+    assert (row["model size"], row["training"], row["selection"]) == (
+        "2.25",
+        "3,000",
+        "77",
+    )
+    # Three tasks of 63 s.
+    assert row["hours, all seeds together"] == "0.05"
+    assert (row["seeds"], row["device"]) == ("2", "cpu")
     assert "abc123" in text
-    assert "curves.png" in text
+    assert all(path.name in text for path in report.paths if path.suffix == ".png")
 
-    with report.csv.open() as file:
-        rows = list(csv.DictReader(file))
-    assert float(cell(rows, "after", "1")["mean"]) == 2100
-    assert float(cell(rows, "after", "1")["std"]) == pytest.approx(200 / 2**0.5)
-    assert float(cell(rows, "forgetting", "1")["mean"]) == -500
-    assert float(cell(rows, "performance")["mean"]) == pytest.approx(end)
+    tasks = rows(report.tasks)
+    assert [row["name"] for row in tasks] == ["hugefoot", "moon", "carry_stuff"]
+    assert float(tasks[1]["after_mean"]) == 2100
+    assert float(tasks[1]["after_std"]) == pytest.approx(200 / 2**0.5)
+    assert float(tasks[1]["forgetting_mean"]) == -500
+    (row,) = rows(report.csv)
+    assert row["unit"] == "raw return"
+    assert float(row["performance_mean"]) == pytest.approx(end)
+    assert row["forward_transfer_mean"] == ""
+    assert float(row["iqm_low"]) <= 1700 <= float(row["iqm_high"])
     # Chunks of 250 and 500 interactions in 1 s and 2 s; the first ones compiled.
-    assert float(cell(rows, "interactions_per_second")["mean"]) == 2 * 750 / 3
+    assert float(row["interactions_per_second"]) == 2 * 750 / 3
 
     (data,) = json.loads(report.json.read_text())["runs"]
     assert data["tasks"][0]["end"]["values"] == [400, 600]
+    assert data["scores"][1][2] == [600, 1700, 3200]
     assert data["mean_forgetting"]["mean"] == pytest.approx(-1100 / 3)
     assert data["provenance"]["commit"] == "abc123"
-    assert (data["complete"], data["seeds"], data["budget"]) == (True, [0, 1], BUDGET)
+    assert (data["complete"], data["kept"], data["budget"]) == (True, [0, 1], BUDGET)
+    (note,) = report.notes
+    assert note.startswith(RAW)
+
+
+def test_sac_n_normalises(tmp_path: Path) -> None:
+    # Seeds of a run are 200 apart: the base's average at the end is 1900 + 100.
+    ends = np.array([900.0, 1800, 3000])
+    base = np.array([[0, 0, 0], [1000, 0, 0], [1000, 1900, 0], ends])
+    runs = [
+        write_run(tmp_path / "rewire"),
+        write_run(tmp_path / "sac_n", method="sac_n", scores=base, size=7.25),
+    ]
+    report = write_report(runs, tmp_path / "out")
     assert report.notes == ()
+    ours, theirs = report.summaries
+    assert theirs.performance.mean == pytest.approx(1)
+    assert theirs.performance.std == pytest.approx(200 / 2**0.5 / 2000)
+    assert theirs.transfer.mean == pytest.approx(0)
+    assert theirs.forgetting.mean == pytest.approx(-200 / 3 / 2000)
+    assert ours.performance.mean == pytest.approx((4900 / 3 + 100) / 2000)
+    assert ours.iqm.value == pytest.approx(1700 / 2000)
+    assert ours.forgetting.mean == pytest.approx(-1100 / 3 / 2000)
+    # Right after own training 1000, 2000, 3000 against 1000, 1900, 3000.
+    assert ours.transfer.mean == pytest.approx(100 / 3 / 2000)
+    # Returns of single tasks stay returns.
+    assert ours.tasks[0]["end"].mean == 500
+    row = cells(report, "Ours (rewire)")
+    assert row["performance (÷ SAC-N)"] == "0.87 ± 0.07"
+    assert row["paper's Table 1, HalfCheetah (4 scenarios) (÷ SAC-N)"] == "1.17 ± 0.15"
+    assert row["its model size"] == "2.1"
+    assert row["paper's Table 3, this scenario (÷ SAC-N)"] == "1.31 ± 0.21"
+    row = cells(report, "SAC-N")
+    assert row["model size"] == "8.00"
+    assert row["paper's Table 3, this scenario (÷ SAC-N)"] == "–"
+    assert rows(report.csv)[0]["paper_table_3_mean"] == "1.31"
+
+
+def test_partial_runs_are_normalised_by_sac_n_at_their_stage(tmp_path: Path) -> None:
+    scores = SCORES * [[1], [1], [1], [2]]
+    runs = [
+        write_run(tmp_path / "rewire", stages=2),
+        write_run(tmp_path / "sac_n", method="sac_n", scores=scores),
+    ]
+    ours, theirs = write_report(runs, tmp_path / "out").summaries
+    # After two tasks both have 700 and 2000; only SAC-N goes on.
+    assert ours.performance.mean == pytest.approx(1)
+    assert theirs.performance.mean == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"stages": 2}, "SAC-N has finished fewer tasks than another run"),
+        ({"scores": -SCORES}, "SAC-N's average return is not above 0"),
+        ({"diverged": (0, 1)}, "all seeds of SAC-N diverged"),
+    ],
+)
+def test_sac_n_that_cannot_normalise(
+    tmp_path: Path, options: dict[str, Any], why: str
+) -> None:
+    runs = [
+        write_run(tmp_path / "rewire"),
+        write_run(tmp_path / "sac_n", method="sac_n", **options),
+    ]
+    report = write_report(runs, tmp_path / "out")
+    assert report.notes[0] == f"Scores are raw returns, not normalised: {why}."
+    assert report.summaries[0].performance.mean == pytest.approx(4900 / 3 + 100)
+    assert "performance (raw return)" in cells(report, "SAC-N")
+
+
+def test_single_task(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"stages": 1, "tasks": ("hugefoot",)}
+    runs = [
+        write_run(tmp_path / name, method=name, **options)
+        for name in ("rewire", "sac_n")
+    ]
+    ours, theirs = write_report(runs, tmp_path / "out").summaries
+    assert ours.forgetting.mean == 0
+    assert ours.transfer.mean == pytest.approx(0)
+    assert ours.performance == theirs.performance
 
 
 @pytest.mark.parametrize(
@@ -70,12 +177,12 @@ def test_title_names_the_budget(
     title = write_report([write_run(tmp_path / "run", **settings)], tmp_path).title
     assert title == (
         f"halfcheetah/forgetting: {settings.get('profile', 'quick')} profile, "
-        f"1,000 interactions a task, positional backend, {ending}"
+        f"3 of 8 tasks, 1,000 interactions a task, positional backend, {ending}"
     )
 
 
 def test_terminal_fits_its_width(tmp_path: Path) -> None:
-    runs = [write_run(tmp_path / name, method=name) for name in ("rewire", "ft1")]
+    runs = [write_run(tmp_path / name, method=name) for name in METHODS]
     report = write_report(runs, tmp_path / "out")
     text = to_terminal(report)
     tables = [line for line in text.splitlines() if str(tmp_path) not in line]
@@ -89,7 +196,7 @@ def test_terminal_fits_its_width(tmp_path: Path) -> None:
 def test_pictures_are_not_blank(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name, method=name) for name in ("rewire", "ft1")]
     report = write_report(runs, tmp_path / "out")
-    for path in (report.curves, report.matrix):
+    for path in (report.curves, report.matrix, report.tradeoff):
         image = imread(path)
         assert min(image.shape[:2]) > 400
         assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 100
@@ -109,26 +216,28 @@ def test_missing_file_is_named(tmp_path: Path, name: str) -> None:
 def test_diverged_seed_is_left_out(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", seeds=3, diverged=(1,))
     report = write_report([run], tmp_path / "out")
-    (note,) = report.notes
-    assert note.startswith("rewire: seed 1 diverged")
+    note = report.notes[-1]
+    assert note.startswith("Ours (rewire): seed 1 diverged")
     (data,) = json.loads(report.json.read_text())["runs"]
     assert data["kept"] == [0, 2]
     assert data["tasks"][0]["end"]["values"] == [400, 800]
-    assert "| rewire | 2 of 3 |" in report.markdown.read_text()
+    assert cells(report, "Ours (rewire)")["seeds"] == "2 of 3"
 
 
 def test_all_seeds_diverged(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", diverged=(0, 1))
     report = write_report([run], tmp_path / "out")
-    assert "| rewire | 1 hugefoot | – | – | – | – |" in report.markdown.read_text()
+    assert (
+        "| Ours (rewire) | 1 hugefoot | – | – | – | – |" in report.markdown.read_text()
+    )
     assert "seeds 0, 1 diverged" in to_terminal(report).replace("\n", " ")
 
 
 def test_partial_run_says_so(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", stages=2)
     report = write_report([run], tmp_path / "out")
-    (note,) = report.notes
-    assert note.startswith("rewire: unfinished, 2 of 3 tasks")
+    note = report.notes[-1]
+    assert note.startswith("Ours (rewire): unfinished, 2 of 3 tasks")
     text = report.markdown.read_text()
     assert "| 1 hugefoot | 101 ± 141 | 1,100 ± 141 | 800 ± 141 | -300 ± 0 |" in text
     assert "| 3 carry_stuff | 103 ± 141 | – | – | – |" in text
@@ -141,7 +250,7 @@ def test_run_before_training(tmp_path: Path) -> None:
     (run / "training.jsonl").unlink()
     (run / "timing.jsonl").unlink()
     report = write_report([run], tmp_path / "out")
-    assert "no results after training yet" in report.notes[0]
+    assert "no results after training yet" in report.notes[-1]
     assert "| 1 hugefoot | 101 ± 141 | – | – | – |" in report.markdown.read_text()
     (run / "results.jsonl").write_text("")
     with pytest.raises(UserError, match="holds no results yet"):
@@ -151,7 +260,12 @@ def test_run_before_training(tmp_path: Path) -> None:
 def test_runs_of_one_method_are_told_apart(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name) for name in ("a", "b")]
     report = write_report(runs, tmp_path / "out")
-    assert [s.label for s in report.summaries] == ["rewire (a)", "rewire (b)"]
+    assert [s.label for s in report.summaries] == [
+        "Ours (rewire): a",
+        "Ours (rewire): b",
+    ]
+    # The paper's figures are not those of any variant.
+    assert "1.17" not in report.markdown.read_text()
     with pytest.raises(UserError, match="given twice"):
         write_report([runs[0], runs[0]], tmp_path / "out")
 
@@ -173,6 +287,8 @@ def test_one_seed_shows_no_spread(tmp_path: Path) -> None:
     text = report.markdown.read_text()
     assert "1 hugefoot | 1.00 | 1,000 | 400 | -600 |" in text
     assert "1 seed," in report.title
+    # Of three values none is cut.
+    assert cells(report, "Ours (rewire)")["IQM [95% interval]"] == "1,633"
 
 
 def test_out_that_is_a_file(tmp_path: Path) -> None:

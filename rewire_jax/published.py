@@ -1,0 +1,120 @@
+"""The paper's own figures, to stand beside those of runs."""
+
+from typing import NamedTuple
+
+# Methods as the paper calls them.
+NAMES = {
+    "ft1": "FT-1",
+    "ft_l2": "FT-L2",
+    "packnet": "PackNet",
+    "ewc": "EWC",
+    "pnn": "PNN",
+    "sac_n": "SAC-N",
+    "ft_n": "FT-N",
+    "csp": "CSP",
+    "rewire": "Ours (rewire)",
+}
+
+
+class Figures(NamedTuple):
+    """A method's published result.
+
+    Attributes:
+        mean: performance, as a multiple of SAC-N's.
+        std: its standard deviation over seeds.
+        size: model size in plain policies; None where it was not published.
+    """
+
+    mean: float
+    std: float
+    size: float | None = None
+
+
+class Source(NamedTuple):
+    """Results that were published together.
+
+    Attributes:
+        table: where they stand in the paper.
+        name: what they are of.
+        results: by method.
+    """
+
+    table: str
+    name: str
+    results: dict[str, Figures]
+
+    @property
+    def key(self) -> str:
+        """The table's name as part of a column's."""
+        return self.table.lower().replace(" ", "_")
+
+    @property
+    def sized(self) -> bool:
+        """Whether model sizes were published with them."""
+        return any(figures.size for figures in self.results.values())
+
+
+_KINDS = ("forgetting", "transfer", "robustness", "compositionality", "hard")
+# Table 1, by domain; HalfCheetah and Ant are averages over their four scenarios.
+_DOMAINS = {
+    "halfcheetah": Source(
+        "Table 1",
+        "HalfCheetah (4 scenarios)",
+        {
+            "ft1": Figures(0.62, 0.29, 1.0),
+            "ft_l2": Figures(0.38, 0.15, 2.0),
+            "packnet": Figures(0.85, 0.14, 2.0),
+            "ewc": Figures(0.43, 0.24, 3.0),
+            "pnn": Figures(1.03, 0.14, 8.0),
+            "sac_n": Figures(1.00, 0.15, 8.0),
+            "ft_n": Figures(1.16, 0.20, 8.0),
+            "csp": Figures(1.27, 0.27, 5.4),
+            "rewire": Figures(1.17, 0.15, 2.1),
+        },
+    ),
+    "ant": Source(
+        "Table 1",
+        "Ant (4 scenarios)",
+        {
+            "ft1": Figures(0.52, 0.26, 1.0),
+            "ft_l2": Figures(0.78, 0.20, 2.0),
+            "packnet": Figures(1.08, 0.21, 2.0),
+            "ewc": Figures(0.55, 0.24, 3.0),
+            "pnn": Figures(0.98, 0.31, 8.0),
+            "sac_n": Figures(1.00, 0.38, 8.0),
+            "ft_n": Figures(0.97, 0.20, 8.0),
+            "csp": Figures(1.11, 0.17, 3.9),
+            "rewire": Figures(1.22, 0.11, 2.1),
+        },
+    ),
+    "humanoid": Source(
+        "Table 1",
+        "Humanoid",
+        {
+            "ft1": Figures(0.71, 0.07, 1.0),
+            "ft_l2": Figures(0.68, 0.28, 2.0),
+            "packnet": Figures(0.96, 0.21, 2.0),
+            "ewc": Figures(0.94, 0.01, 3.0),
+            "pnn": Figures(0.98, 0.26, 4.0),
+            "sac_n": Figures(1.00, 0.29, 4.0),
+            "ft_n": Figures(0.65, 0.46, 4.0),
+            "csp": Figures(1.76, 0.19, 3.4),
+            "rewire": Figures(1.78, 0.22, 2.0),
+        },
+    ),
+}
+# Table 3, first and last row.
+_SCENARIOS = {
+    "halfcheetah/forgetting": Source(
+        "Table 3",
+        "this scenario",
+        {"ft_l2": Figures(0.67, 0.32), "rewire": Figures(1.31, 0.21)},
+    ),
+}
+
+
+def sources(scenario: str) -> tuple[Source, ...]:
+    """What the paper has on a scenario of its own, and on its domain."""
+    domain, _, kind = scenario.partition("/")
+    whole = _DOMAINS.get(domain) if kind in _KINDS else None
+    return tuple(source for source in (whole, _SCENARIOS.get(scenario)) if source)
