@@ -1,0 +1,66 @@
+"""The paper's Figure 4: performance and model size on the HalfCheetah scenarios.
+
+Beside all methods stand CSP-S, whose policies are narrower, and Ours-L, whose policy is
+wider. Widths are the paper's 175 and 384 of 256, scaled to the profile's networks.
+"""
+
+from dataclasses import dataclass
+
+import rewire_jax
+from experiments import suite
+from rewire_jax import published
+from rewire_jax.scatter import Point, tradeoff
+
+SIZED = {"CSP-S": ("csp", 175 / 256), "Ours-L": ("rewire", 384 / 256)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure4(suite.Experiment):
+    """What to run.
+
+    Attributes:
+      scenarios: names of the scenarios.
+    """
+
+    scenarios: tuple[str, ...] = suite.DOMAINS["halfcheetah"]
+
+
+def variants(job: Figure4, name: str) -> suite.Variants:
+    """Methods and their options by the name of the run."""
+    scenario = rewire_jax.make_scenario(name, job.backend)
+    chosen: suite.Variants = {method: (method, {}) for method in published.NAMES}
+    for label, (method, factor) in SIZED.items():
+        hidden = rewire_jax.preset(scenario, method, job.profile).sac.hidden
+        chosen[label.lower()] = method, {"width": round(factor * hidden)}
+    return chosen
+
+
+def run(job: Figure4) -> None:
+    """Trains what is not finished, and writes a report a scenario and the figure.
+
+    Raises:
+      UserError: wrong arguments.
+      rewire_jax.Stopped: interrupted; the same command goes on.
+    """
+    out = job.out / job.name("figure4")
+    runs = [r for name in job.scenarios for r in job.runs(name, variants(job, name))]
+    reports = suite.reports(suite.train(runs, job), out)
+    found = suite.averages(reports)
+    labels = published.NAMES | {label.lower(): label for label in SIZED}
+    table, rows, points = [["method", "performance", "model size"]], [], []
+    for name, label in labels.items():
+        ours = found.get(name)
+        table.append([label, suite.text(ours, len(job.scenarios)), suite.size(ours)])
+        rows.append({"method": label} | suite.columns("", ours))
+        if ours:
+            points.append(Point(label, ours.size, ours.mean, ours.std))
+    title = f"Figure 4, {', '.join(job.scenarios)}, {job.profile} profile"
+    picture = out / "figure4.png"
+    notes = (f"![{title}]({picture.name})", "", suite.READING, "")
+    suite.write(out / "figure4", title, table, (*notes, *suite.origins(reports)), rows)
+    tradeoff(points, "÷ SAC-N", title, picture)
+    print(picture)
+
+
+if __name__ == "__main__":
+    suite.command(Figure4, run, "figure4_tradeoff")

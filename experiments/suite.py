@@ -1,0 +1,306 @@
+"""What the experiments share: runs, one after the other, and files of results.
+
+A run that is finished is not run again, and one that was stopped goes on, so the same
+command can be given until all is done. Experiments find each other's runs.
+"""
+
+import csv
+import json
+import statistics
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import tyro
+
+import rewire_jax
+from rewire_jax.config import flag, require
+from rewire_jax.errors import UserError
+from rewire_jax.plan import prepare
+from rewire_jax.published import Figures
+from rewire_jax.report import Report
+from rewire_jax.rundata import read_run
+from rewire_jax.runfolder import HEADER, TABLES, provenance, read_header
+from rewire_jax.summary import Summary
+
+T = TypeVar("T")
+Variants = dict[str, tuple[str, dict[str, Any]]]
+"""Methods and some of their options, by the name of the run."""
+
+RESULTS = Path("experiments/results")
+READING = (
+    "Performance is the return at the end, averaged over tasks, divided by that of "
+    "SAC-N; that of several scenarios is the mean over them, of means and of standard "
+    "deviations over seeds. Runs that are not finished have no part in it. Model size "
+    "is in plain policies. The paper's results were made with Brax v1, whose physics "
+    "is another."
+)
+_KINDS = ("forgetting", "transfer", "robustness", "compositionality")
+DOMAINS = {
+    "halfcheetah": tuple(f"halfcheetah/{kind}" for kind in _KINDS),
+    "ant": tuple(f"ant/{kind}" for kind in _KINDS),
+    "humanoid": ("humanoid/hard",),
+}
+# What a command can ask for; a run that is already there must be the same in it.
+_ASKED = ("scenario", "method", "profile", "backend", "seed", "seeds", "interactions")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """How to run.
+
+    Attributes:
+      profile: "quick" or "paper".
+      seeds: members of each run.
+      seed: of the first member.
+      interactions: of training for each task; 0 takes the profile's.
+      backend: physics backend.
+      train: otherwise report on the runs that there are, as far as they have come.
+    """
+
+    profile: str = "quick"
+    seeds: int = 1
+    seed: int = 0
+    interactions: int = 0
+    backend: str = "positional"
+    train: bool = True
+
+    def name(self, what: str) -> str:
+        """Name of a folder for something made with this profile and budget."""
+        name = f"{what.replace('/', '-')}-{self.profile}"
+        return f"{name}-{self.interactions}" if self.interactions else name
+
+    def run(
+        self, scenario: rewire_jax.Scenario, method: str, folder: Path, **options: Any
+    ) -> "Run":
+        """A run of the profile, with these of the method's options."""
+        settings = rewire_jax.preset(scenario, method, self.profile)
+        settings = replace(
+            settings,
+            seeds=self.seeds,
+            seed=self.seed,
+            interactions=self.interactions or settings.interactions,
+            options=replace(settings.options, **options),
+        )
+        return Run(folder, scenario, settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment(Job):
+    """How to run, and where.
+
+    Attributes:
+      out: folder of all runs, with a folder for each scenario, and of the results.
+    """
+
+    out: Path = Path("runs")
+
+    def runs(self, scenario: str, variants: Variants) -> list["Run"]:
+        """The runs on one scenario."""
+        made = rewire_jax.make_scenario(scenario, self.backend)
+        folder = self.out / self.name(scenario)
+        return [
+            self.run(made, method, folder / name, **options)
+            for name, (method, options) in variants.items()
+        ]
+
+
+class Run(NamedTuple):
+    """One of an experiment's runs: its folder, what is learned and how."""
+
+    folder: Path
+    scenario: rewire_jax.Scenario
+    settings: rewire_jax.Settings
+
+    @property
+    def started(self) -> bool:
+        """Whether the folder holds a run."""
+        return (self.folder / HEADER).exists()
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether there is something to report on."""
+        return self.started and (self.folder / TABLES[0]).exists()
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to be trained."""
+        return self.evaluated and read_run(self.folder).complete
+
+
+def train(runs: Sequence[Run], job: Job) -> list[Run]:
+    """Trains the runs that are not finished, one after the other.
+
+    Args:
+      runs: in their order.
+      job: whether to train at all.
+
+    Returns:
+      The runs that there is something to report on.
+
+    Raises:
+      UserError: wrong settings, or another run in a folder, before anything is run; or
+        there is nothing to report on.
+      rewire_jax.Stopped: interrupted; the same command goes on.
+    """
+    # What is wrong is found before the first run has gone on for hours.
+    for run in runs:
+        if run.started:
+            _compare(run)
+        prepare(run.settings, run.scenario)
+    for run in runs if job.train else ():
+        if run.finished:
+            print(f"{run.folder}: finished before, not run again", file=sys.stderr)
+            continue
+        rewire_jax.train(
+            run.settings, run.folder, scenario=run.scenario, resume=run.started
+        )
+    evaluated = [run for run in runs if run.evaluated]
+    require(bool(evaluated), "none of the runs has results yet")
+    return evaluated
+
+
+def _compare(run: Run) -> None:
+    saved = read_header(run.folder)["settings"]
+    for name in _ASKED:
+        then, now = saved.get(name), getattr(run.settings, name)
+        require(
+            then == now,
+            f"{run.folder} was run with {flag(name)} {then}, not {now}; drop it or "
+            "name another --out",
+        )
+
+
+def reports(runs: Sequence[Run], out: Path) -> list[Report]:
+    """Writes a report for each scenario into a folder of its own."""
+    folders: dict[str, list[Path]] = {}
+    for run in runs:
+        name = run.settings.scenario.replace("/", "-")
+        folders.setdefault(name, []).append(run.folder)
+    return [rewire_jax.write_report(each, out / name) for name, each in folders.items()]
+
+
+class Average(NamedTuple):
+    """What the runs of a name have in common.
+
+    Attributes:
+      mean: performance ÷ SAC-N's, the mean over scenarios of that over seeds.
+      std: the mean over scenarios of the standard deviation over seeds; None with a
+        single seed.
+      size: model size, the mean over scenarios.
+      scenarios: how many these are.
+    """
+
+    mean: float
+    std: float | None
+    size: float
+    scenarios: int
+
+
+def averages(made: Sequence[Report]) -> dict[str, Average]:
+    """Averages over scenarios by name of the run's folder.
+
+    Runs that are not finished, or that no SAC-N run normalises, have no part in them.
+    """
+    found: dict[str, list[Summary]] = {}
+    for report in made:
+        for summary in () if report.comparison.raw else report.summaries:
+            if summary.run.complete and summary.performance.values:
+                found.setdefault(summary.run.folder.name, []).append(summary)
+    return {name: _average(summaries) for name, summaries in found.items()}
+
+
+def _average(summaries: Sequence[Summary]) -> Average:
+    stds = [s.performance.std for s in summaries]
+    return Average(
+        mean=statistics.mean(s.performance.mean or 0.0 for s in summaries),
+        std=None if None in stds else statistics.mean(x for x in stds if x is not None),
+        size=statistics.mean(s.run.model_size for s in summaries),
+        scenarios=len(summaries),
+    )
+
+
+def text(value: Average | Figures | None, scenarios: int = 1) -> str:
+    """A performance as tables show it; says so if it is not of all scenarios."""
+    if value is None:
+        return "–"
+    shown = f"{value.mean:.2f}"
+    if value.std is not None:
+        shown += f" ± {value.std:.2f}"
+    if isinstance(value, Average) and value.scenarios < scenarios:
+        shown += f" ({value.scenarios} of {scenarios} scenarios)"
+    return shown
+
+
+def size(value: Average | Figures | None) -> str:
+    """A model size as tables show it; the paper's has one decimal."""
+    if value is None or value.size is None:
+        return "–"
+    return f"{value.size:.2f}" if isinstance(value, Average) else f"{value.size:.1f}"
+
+
+def columns(prefix: str, value: Average | Figures | None) -> dict[str, Any]:
+    """The same as numbers, for `write`."""
+    names = {"mean": "performance", "std": "performance_std", "size": "model_size"}
+    return {prefix + to: getattr(value, name, None) for name, to in names.items()}
+
+
+def origins(made: Sequence[Report]) -> list[str]:
+    """Markdown: what the reports are of, what is missing, where runs come from."""
+    lines = []
+    for report in made:
+        lines += [f"- {report.title}", *(f"  - **{note}**" for note in report.notes)]
+        for summary in report.summaries:
+            run, how = summary.run, summary.run.provenance
+            seeds = ", ".join(str(seed) for seed in run.seeds)
+            lines.append(
+                f"  - {summary.label}: `{run.folder}`, seeds {seeds}, "
+                f"{run.finished} of {len(run.tasks)} tasks, commit "
+                f"`{how.get('commit')}`, started `{how.get('started')}`"
+            )
+    return lines
+
+
+def write(
+    path: Path,
+    title: str,
+    table: Sequence[Sequence[str]],
+    notes: Sequence[str],
+    rows: Sequence[Mapping[str, Any]],
+) -> None:
+    """Writes a result as Markdown, CSV and JSON, and prints it.
+
+    Args:
+      path: of the files, without a suffix.
+      title: above the table.
+      table: for people, its headings first.
+      notes: lines of Markdown below it.
+      rows: the numbers, all with the same columns.
+    """
+    head, *body = table
+    lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)]
+    shown = "\n".join([f"# {title}", "", *lines, "", *notes]) + "\n"
+    result = {"title": title, "rows": rows, "provenance": provenance()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.with_suffix(".md").write_text(shown, encoding="utf-8")
+    path.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
+    with path.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    print(shown)
+    print(*(path.with_suffix(end) for end in (".md", ".csv", ".json")), sep="\n")
+
+
+def command(kind: type[T], run: Callable[[T], Any], name: str) -> None:
+    """Reads the command line and runs; exits with 2 on a user's error."""
+    try:
+        run(tyro.cli(kind, prog=f"python -m experiments.{name}"))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except rewire_jax.Stopped:
+        print("stopped and saved; the same command goes on", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,88 @@
+"""The paper's Table 3: what each of rewiring's designs adds to FT-L2.
+
+The rows without alignment hold the weights near the previous ones as FT-L2 does, with
+its published coefficient: the paper starts from FT-L2 and adds the designs. SAC-N runs
+besides, to normalise.
+"""
+
+from dataclasses import dataclass
+
+import rewire_jax
+from experiments import suite
+from rewire_jax.published import Figures
+
+# By name of the run: marks for rewiring ("*": without caching), multi-mode and
+# alignment, and what the paper has.
+ROWS = {
+    "ft_l2": ("", "", "", Figures(0.67, 0.32)),
+    "rewire-uncached": ("*", "", "", Figures(0.76, 0.29)),
+    "rewire-cached": ("✓", "", "", Figures(0.95, 0.24)),
+    "rewire-modes": ("✓", "✓", "", Figures(1.14, 0.22)),
+    "rewire-aligned": ("✓", "", "✓", Figures(1.15, 0.25)),
+    "rewire": ("✓", "✓", "✓", Figures(1.31, 0.21)),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table3(suite.Experiment):
+    """What to run.
+
+    Attributes:
+      scenario: name of the scenario.
+    """
+
+    scenario: str = "halfcheetah/forgetting"
+
+
+def variants(job: Table3) -> suite.Variants:
+    """Methods and their options by the name of the run."""
+    scenario = rewire_jax.make_scenario(job.scenario, job.backend)
+    plain = rewire_jax.preset(scenario, "ft_l2", job.profile).options
+    unaligned = {"alignment": "off", "beta": plain.coefficient}
+    single = {"modes": 1}
+    return {
+        "sac_n": ("sac_n", {}),
+        "ft_l2": ("ft_l2", {}),
+        "rewire-uncached": ("rewire", {"caching": False} | single | unaligned),
+        "rewire-cached": ("rewire", single | unaligned),
+        "rewire-modes": ("rewire", unaligned),
+        "rewire-aligned": ("rewire", single),
+        "rewire": ("rewire", {}),
+    }
+
+
+def run(job: Table3) -> None:
+    """Trains what is not finished, and writes the report and the table.
+
+    Raises:
+      UserError: wrong arguments.
+      rewire_jax.Stopped: interrupted; the same command goes on.
+    """
+    out = job.out / job.name("table3")
+    runs = suite.train(job.runs(job.scenario, variants(job)), job)
+    reports = suite.reports(runs, out)
+    found = suite.averages(reports)
+    head = ["rewire", "multi-mode", "alignment", "performance", "model size", "paper"]
+    table, rows = [head], []
+    for name, (rewire, modes, alignment, paper) in ROWS.items():
+        ours = found.get(name)
+        cells = suite.text(ours), suite.size(ours), suite.text(paper)
+        table.append([rewire, modes, alignment, *cells])
+        rows.append(
+            {"run": name} | suite.columns("", ours) | suite.columns("paper_", paper)
+        )
+    notes = (
+        suite.READING,
+        "",
+        "\\*: without caching. Rows without alignment hold the weights near the "
+        "previous ones, with FT-L2's coefficient. The paper's are of "
+        "halfcheetah/forgetting.",
+        "",
+        *suite.origins(reports),
+    )
+    title = f"Table 3 on {job.scenario}, {job.profile} profile"
+    suite.write(out / "table3", title, table, notes, rows)
+
+
+if __name__ == "__main__":
+    suite.command(Table3, run, "table3_ablation")
