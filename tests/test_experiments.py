@@ -1,0 +1,248 @@
+import csv
+import dataclasses
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rewire_jax
+from experiments import (
+    bench_brax,
+    figure4_tradeoff,
+    model_sizes,
+    suite,
+    table1_brax,
+    table3_ablation,
+)
+from experiments.figure4_tradeoff import Figure4
+from experiments.table1_brax import Table1
+from experiments.table3_ablation import Table3
+from rewire_jax.errors import UserError
+from rewire_jax.scenarios import SCENARIOS
+from tests.fake_run import GAP, SCORES, write_run
+
+NAMES = ("halfcheetah/forgetting", "halfcheetah/transfer")
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Scenarios without physics, and training that writes numbers; what was called."""
+    for name in NAMES:
+        spec = dataclasses.replace(SCENARIOS["probe/reach"], name=name)
+        monkeypatch.setitem(SCENARIOS, name, spec)
+    calls = []
+
+    def train(settings, folder, *, scenario, resume):
+        assert scenario.name == settings.scenario
+        # Rewire stops on the way in the second scenario.
+        stop = settings.method == "rewire" and settings.scenario == NAMES[1]
+        calls.append((folder, settings, resume))
+        if resume:
+            (folder / "settings.json").unlink()
+            folder.rename(folder.with_suffix(".before"))
+        facts = vars(settings) | {"method": settings.method}
+        for name in ("sac", "options", "tasks"):
+            facts.pop(name)
+        write_run(
+            folder,
+            stages=2 if stop and not resume else 3,
+            scores=SCORES * FACTORS.get((settings.method, settings.scenario), 1.0),
+            **facts,
+        )
+
+    monkeypatch.setattr(rewire_jax, "train", train)
+    return calls
+
+
+FACTORS = {("ft1", NAMES[0]): 0.5, ("ft1", NAMES[1]): 1.5}
+
+
+def performance(factor):
+    """Mean and standard deviation over two seeds, divided by SAC-N's."""
+    end = SCORES[-1].mean()
+    seeds = np.array([factor * end, factor * end + GAP]) / (end + GAP / 2)
+    return seeds.mean(), seeds.std(ddof=1)
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_table1_averages_over_finished_runs(trained, tmp_path, capsys):
+    job = Table1(scenarios=NAMES, methods=("ft1", "rewire"), seeds=2, out=tmp_path)
+    table1_brax.run(job)
+    assert [(f.parent.name, f.name) for f, _, _ in trained] == [
+        (f"halfcheetah-{kind}-quick", method)
+        for kind in ("forgetting", "transfer")
+        for method in ("sac_n", "ft1", "rewire")
+    ]
+    out = tmp_path / "table1-quick"
+    found = {row["method"]: row for row in rows(out / "table1.csv")}
+    half, more = performance(0.5), performance(1.5)
+    assert float(found["ft1"]["performance"]) == pytest.approx((half[0] + more[0]) / 2)
+    assert float(found["ft1"]["performance_std"]) == pytest.approx(half[1])
+    assert float(found["ft1"]["paper_performance"]) == 0.62
+    assert float(found["rewire"]["performance"]) == pytest.approx(1.0)
+    shown = (out / "table1.md").read_text()
+    assert "1.00 ± 0.08 (1 of 2 scenarios)" in shown
+    assert "1.17 ± 0.15 | 2.1 |" in shown
+    assert "Ours (rewire): unfinished, 2 of 3 tasks" in shown
+    made = json.loads((out / "table1.json").read_text())
+    assert made["provenance"]["commit"]
+    assert (out / "halfcheetah-transfer" / "report.md").exists()
+    # The same command goes on with the one run that was stopped.
+    table1_brax.run(job)
+    ((folder, _, resume),) = trained[6:]
+    assert folder.name == "rewire"
+    assert resume
+    assert "finished before" in capsys.readouterr().err
+    assert "of 2 scenarios" not in (out / "table1.md").read_text()
+
+
+def test_tables_of_what_there_is(trained, tmp_path):
+    job = Table1(scenarios=NAMES, methods=("ft1",), out=tmp_path, train=False)
+    with pytest.raises(UserError, match="none of the runs has results"):
+        table1_brax.run(job)
+    table1_brax.run(dataclasses.replace(job, scenarios=NAMES[:1], train=True))
+    table1_brax.run(job)
+    assert len(trained) == 2
+    shown = (tmp_path / "table1-quick" / "table1.md").read_text()
+    assert "(1 of 2 scenarios)" in shown
+
+
+def test_another_run_in_the_folder_is_refused(trained, tmp_path):
+    job = Table1(scenarios=NAMES[:1], methods=("ft1",), out=tmp_path)
+    table1_brax.run(job)
+    with pytest.raises(UserError, match="with --seeds 1, not 3"):
+        table1_brax.run(dataclasses.replace(job, seeds=3))
+    # Another budget has folders of its own.
+    table1_brax.run(dataclasses.replace(job, interactions=20_000))
+    assert trained[-1][0].parent.name == "halfcheetah-forgetting-quick-20000"
+    assert trained[-1][1].interactions == 20_000
+
+
+def test_table3_turns_the_designs_on_one_by_one(trained, tmp_path):
+    table3_ablation.run(Table3(out=tmp_path))
+    options = {folder.name: settings.options for folder, settings, _ in trained}
+    assert list(options) == ["sac_n", *table3_ablation.ROWS]
+    designs = {
+        name: (options[name].caching, options[name].modes, options[name].alignment)
+        for name in list(table3_ablation.ROWS)[1:]
+    }
+    assert designs == {
+        "rewire-uncached": (False, 1, "off"),
+        "rewire-cached": (True, 1, "off"),
+        "rewire-modes": (True, 3, "off"),
+        "rewire-aligned": (True, 1, "expanded"),
+        "rewire": (True, 3, "expanded"),
+    }
+    for name in ("rewire-uncached", "rewire-cached", "rewire-modes"):
+        assert options[name].beta == options["ft_l2"].coefficient == 1e4
+    assert options["rewire-aligned"].beta == options["rewire"].beta == 100
+    found = rows(tmp_path / "table3-quick" / "table3.csv")
+    assert [row["performance"] for row in found] == ["1.0"] * 6
+    published = [float(row["paper_performance"]) for row in found]
+    assert published == [0.67, 0.76, 0.95, 1.14, 1.15, 1.31]
+
+
+def test_figure4_has_narrower_and_wider_policies(trained, tmp_path):
+    job = Figure4(scenarios=NAMES[:1], out=tmp_path)
+    figure4_tradeoff.run(job)
+    width = {f.name: s.options.width for f, s, _ in trained if "-" in f.name}
+    assert width == {"csp-s": 88, "ours-l": 192}
+    found = {row["method"]: row for row in rows(tmp_path / "figure4-quick/figure4.csv")}
+    assert len(found) == 11
+    assert float(found["FT-1"]["performance"]) == pytest.approx(0.5)
+    assert (tmp_path / "figure4-quick" / "figure4.png").stat().st_size > 0
+    paper = figure4_tradeoff.variants(Figure4(profile="paper"), NAMES[0])
+    assert paper["csp-s"] == ("csp", {"width": 175})
+    assert paper["ours-l"] == ("rewire", {"width": 384})
+
+
+@pytest.mark.parametrize(
+    ("module", "kind", "arguments"),
+    [
+        (bench_brax, bench_brax.Bench, "--methods ft1 magic"),
+        (bench_brax, bench_brax.Bench, "--scenario probe/rech"),
+        (table1_brax, Table1, "--methods magic"),
+        (table1_brax, Table1, "--scenarios probe/reach probe/rech"),
+        (table3_ablation, Table3, "--scenario probe/reach --profile slow"),
+        (figure4_tradeoff, Figure4, "--scenarios probe/reach --interactions 3"),
+    ],
+)
+def test_what_is_wrong_ends_in_a_line_before_anything_runs(
+    module, kind, arguments, trained, tmp_path, monkeypatch, capsys
+):
+    name = module.__name__.removeprefix("experiments.")
+    if "scenario" not in arguments:
+        arguments += f" --scenario{'s' if kind is Table1 else ''} probe/reach"
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", [name, *arguments.split(), "--out", str(out)])
+    with pytest.raises(SystemExit) as caught:
+        suite.command(kind, module.run, name)
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    assert not trained
+    assert not out.exists()
+
+
+COMMITTED = Path(__file__).parents[1] / "experiments/results/model-sizes.json"
+HEADS = {"halfcheetah/robustness": 2, "ant/robustness": 2}
+
+
+def formula(method, row):
+    """Numbers stored at the most, written out a second time."""
+    o, a, n = row["observations"], row["actions"], row["hidden"]
+    tasks, w = row["tasks"], 96
+
+    def plain(width):
+        sizes = [o, width, width, width, 2 * a]
+        return sum(i * j + j for i, j in itertools.pairwise(sizes))
+
+    column = plain(w)
+    outer = 2 * (w * w + w) + w * 2 * a + 2 * a + 3
+    inner = sum(3 * (w * place) * w for place in range(tasks))
+    heads = HEADS.get(row["scenario"], 4)
+    head = n * 2 * a + 2 * a
+    scores, orders, adapters = 3 * 3 * n, heads * 3 * n, 3 * n + 2 * n
+    hidden = plain(n) - head
+    return {
+        "ft1": plain(n),
+        "ft_l2": 2 * plain(n),
+        "packnet": 2 * plain(n),
+        "ewc": 3 * plain(n),
+        "pnn": tasks * column + (tasks - 1) * outer + inner,
+        "sac_n": tasks * plain(n),
+        "ft_n": tasks * plain(n),
+        "csp": tasks * plain(n),
+        "rewire": 2 * hidden + (heads + 1) * head + scores + orders + adapters,
+    }[method]
+
+
+def test_committed_model_sizes_follow_the_formulas():
+    found = json.loads(COMMITTED.read_text())["rows"]
+    assert {row["scenario"] for row in found} == {
+        name for names in suite.DOMAINS.values() for name in names
+    }
+    for row in found:
+        assert row["most"] == formula(row["method"], row), row
+        least = row["plain"] if row["method"] == "csp" else row["most"]
+        assert row["least"] == least
+        assert row["plain"] == formula("ft1", row)
+    shown = COMMITTED.with_suffix(".md").read_text()
+    for line in model_sizes.table(found):
+        assert f"| {' | '.join(line)} |" in shown
+
+
+def test_model_sizes_are_those_committed():
+    name = "halfcheetah/robustness"
+    found = json.loads(COMMITTED.read_text())["rows"]
+    expected = [r for r in found if r["scenario"] == name and r["observations"] == 17]
+    assert len(expected) == 9
+    assert list(itertools.islice(model_sizes.measure(name), 9)) == expected
