@@ -63,7 +63,9 @@ class Run:
                 raise Stopped(
                     f"stopped and saved: continue with --resume --out {self.folder}"
                 )
-        now, returns = self.conclude(now, task)
+        now = self.conclude(now, task)
+        # By now the replay buffer is gone.
+        returns = [_finite(float(r)) for r in self.evaluate(now, stage)[:, stage]]
         standing.save(self.folder, now)
         self.progress.finish_task(stage, returns, clock.perf_counter() - began)
         return now
@@ -94,7 +96,6 @@ class Run:
         number = candidates.valid.shape[1]
         # They take turns where there are more rows than candidates.
         turn = jnp.arange(rows) % number
-        share = jax.nn.one_hot(turn, number) / jnp.bincount(turn, length=number)
         result = program.rollout(
             jax.tree.map(lambda leaf: jnp.stack([leaf] * rows), task),
             jax.tree.map(lambda leaf: leaf[:, turn], candidates.policies),
@@ -102,8 +103,10 @@ class Run:
             self.plan.episodes,
         )
         used = jnp.sum(result.lengths, axis=2) * candidates.valid[:, turn]
-        returns = jnp.mean(result.returns, axis=2) @ share
-        return returns, now.selection + jnp.sum(used, axis=1)
+        means = jnp.mean(result.returns, axis=2)
+        # Not a product with shares: 0 times NaN would spoil all candidates.
+        own = [jnp.mean(means[:, i::number], axis=1) for i in range(number)]
+        return jnp.stack(own, axis=1), now.selection + jnp.sum(used, axis=1)
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""
@@ -174,8 +177,8 @@ class Run:
         for seed, lost in zip(self.plan.seeds, now.alive & ~alive, strict=True):
             if lost:
                 self.progress.message(
-                    f"seed {seed}: a value is not finite in task {now.stage}; its "
-                    "learner stays as it was, try lower learning rates"
+                    f"seed {seed}: a value is not finite in task {now.stage}; it is "
+                    "updated no more, try lower learning rates"
                 )
         return now._replace(steps=now.steps + steps, state=state, alive=alive)
 
@@ -228,9 +231,11 @@ class Run:
         }
         runfolder.append(self.folder, "timing.jsonl", [timing])
         for row in rows:
-            self.events.training(row, settings.interactions)
+            self.events.training(row, plan.interactions)
         rate = steps * settings.envs * len(rows) / seconds
-        left = plan.interactions * (settings.tasks - stage) - interactions
+        # As if steps that only update took as long as the others.
+        steps_left = (plan.steps + plan.polishing) * (settings.tasks - stage)
+        left = (steps_left - now.steps) * settings.envs
         self.progress.update(
             stage,
             interactions,
@@ -239,18 +244,14 @@ class Run:
             None if compiled else left * len(rows) / rate,
         )
 
-    def conclude(
-        self, now: Standing, task: Task
-    ) -> tuple[Standing, list[float | None]]:
-        """Lets the method end the task, and evaluates all tasks."""
+    def conclude(self, now: Standing, task: Task) -> Standing:
+        """Lets the method choose among its candidates, and end the task."""
         program, members, stage = self.plan.program, self.plan.members, now.stage
         assert now.state is not None
         learner = now.state.learner
         after, spent = self.select(now, learner, task, 1)
-        chosen_by = None
-        if now.before is not None and after is not None:
-            chosen_by = Selection(now.before, after)
-        now = Standing(
+        chosen_by = None if after is None else Selection(now.before, after)
+        return Standing(
             stage=stage + 1,
             steps=0,
             learner=program.finish(members, learner, stage, chosen_by),
@@ -259,8 +260,6 @@ class Run:
             alive=now.alive,
             selection=spent,
         )
-        returns = self.evaluate(now, stage)
-        return now, [_finite(float(r)) for r in returns[:, stage]]
 
     def evaluate(self, now: Standing, stage: int) -> np.ndarray:
         """Plays all tasks without exploration; returns `[members, tasks]`."""

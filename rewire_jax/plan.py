@@ -93,7 +93,9 @@ def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
     seeds = tuple(range(settings.seed, settings.seed + settings.seeds))
     sequence = scenario.tasks[: settings.tasks]
     members = population.members([(settings.sac, settings.options)], seeds)
-    built = program.build(environment, entry.make, spec, shape, settings.options)
+    # Its numbers do not matter; runs that differ in them alone share the program.
+    example = jax.tree.map(lambda _: 0.0, settings.options)
+    built = program.build(environment, entry.make, spec, shape, example)
     method = entry.make(spec, settings.options)
     rows, episodes = _selection(settings, built, members)
     budget = settings.interactions

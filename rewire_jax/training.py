@@ -51,7 +51,7 @@ class State(NamedTuple):
     Attributes:
       learner: all that learning changes.
       collection: all that collecting changes.
-      alive: `[]` bool; once a value is not finite the learner stays as it was.
+      alive: `[]` bool; once a value is not finite the learner is updated no more.
     """
 
     learner: sac.Learner

@@ -213,21 +213,24 @@ def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     settings = dataclasses.replace(
         settings, tasks=8, sac=dataclasses.replace(settings.sac, hidden=12)
     )
-    continual.train(settings, tmp_path / "run", scenario=scenario)
     prepared = plan.prepare(settings, scenario)
-    # Evaluation and selection are looked up below; this method does the rest not.
+    made = rewire_jax.methods.find_method("rewire").make(
+        prepared.spec, prepared.settings.options
+    )
+    # Evaluation, and selection: twelve episodes in eight rows. Other tests use them.
+    shared = [
+        rollout_function(scenario.environment, made.act, 8, count) for count in (4, 1)
+    ]
+    before = [function._cache_size() for function in shared]
+    continual.train(settings, tmp_path / "run", scenario=scenario)
+    assert [f._cache_size() - n for f, n in zip(shared, before, strict=True)] == [1, 1]
+    # Neither of the last two is for this method.
     others = ("rollout", "baseline", "consolidate", "polish")
     program = prepared.program._asdict()
     program = {name: f for name, f in program.items() if name not in others}
     assert {name: f._cache_size() for name, f in program.items()} == dict.fromkeys(
         program, 1
     )
-    method = rewire_jax.methods.find_method("rewire")
-    made = method.make(prepared.spec, prepared.settings.options)
-    # Evaluation, and selection: twelve episodes in eight rows.
-    for count in (4, 1):
-        function = rollout_function(scenario.environment, made.act, 8, count)
-        assert function._cache_size() == 1
     assert len(rows(tmp_path / "run")) == 9 * 8 * 2
 
 

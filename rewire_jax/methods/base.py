@@ -116,8 +116,8 @@ class Method(NamedTuple):
       fresh_critic: whether the critics, too, start anew with each task.
       consolidate: `(key, params, memory, task, tools) -> params, memory`, when a
         task's interactions are over; or None.
-      offline: updates from the buffer after that, with fresh optimisers and
-        temperature: a share of the interactions.
+      offline: updates from the buffer after that, a share of the interactions. They
+        begin with fresh optimisers and temperature, and need `consolidate`.
       candidates: `(params, memory, task) -> Candidates`, rolled out at the end of
         each task, or None where nothing is to be chosen.
       baseline: whether they are rolled out at a task's start, too.

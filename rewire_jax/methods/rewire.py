@@ -106,11 +106,13 @@ _PUBLISHED = {
 def preset(scenario: str, period: int, profile: str) -> RewireSettings:
     """Published settings, or the defaults with a head for each task of a round.
 
-    The published `beta` belongs to the authors' form of the alignment loss. The quick
-    profile's `adapter_rate` is ours: in its few updates the adapters would else not
-    settle (see `adapter_rate`).
+    The published `alpha` and `beta` belong to the authors' forms of the losses. The
+    quick profile's `adapter_rate` is ours: in its few updates the adapters would else
+    not settle (see `adapter_rate`).
     """
-    published = dataclasses.replace(_published(scenario, period), alignment="expanded")
+    published = dataclasses.replace(
+        _published(scenario, period), distillation="squares", alignment="expanded"
+    )
     if profile == "paper":
         return published
     return dataclasses.replace(published, adapter_rate=10.0)
