@@ -556,10 +556,9 @@ def test_a_member_is_the_same_alone_and_in_a_crowd():
 # A run
 
 
-def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
-    scenario = make_scenario("probe/reach")
+def tiny(scenario, **options):
     quick = rewire_jax.preset(scenario, "csp", "quick")
-    settings = dataclasses.replace(
+    return dataclasses.replace(
         quick,
         seeds=2,
         interactions=640,
@@ -568,9 +567,14 @@ def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
         warmup=160,
         eval_episodes=4,
         selection_episodes=4,
-        options=dataclasses.replace(quick.options, **SEARCH, resample_every=7),
+        options=dataclasses.replace(quick.options, **SEARCH, **options),
         sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
     )
+
+
+def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
+    scenario = make_scenario("probe/reach")
+    settings = tiny(scenario, resample_every=7)
     folder = continual.train(settings, tmp_path / "run")
     lines = (folder / "results.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])["interactions"]
@@ -578,7 +582,6 @@ def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
     search = 4 * scenario.environment.episode_length
     assert last["training"] + 4 * search == 4 * settings.interactions
     assert last["selection"] == 3 * search
-    seen = []
     for seed in range(2):
         for task in range(4):
             outputs = [
@@ -587,8 +590,25 @@ def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
             ]
             for output in outputs:
                 np.testing.assert_array_equal(output, outputs[0])
-            seen.append(np.asarray(outputs[0]))
-    assert len({output.tobytes() for output in seen}) == len(seen)
+
+
+@pytest.mark.parametrize(("improvement", "anchors"), [(1e9, 1), (0.0, 4)])
+def test_a_run_keeps_an_anchor_by_its_return(
+    improvement, anchors, tmp_path, monkeypatch
+):
+    # Returns are above 0 here, and the newest anchor's proposals always play best.
+    scenario = make_scenario("probe/reach")
+    settings = tiny(scenario, improvement=improvement)
+    select = continual.Run.select
+
+    def ranked(self, now, learner, task, phase):
+        returns, used = select(self, now, learner, task, phase)
+        return jnp.broadcast_to(jnp.array([4.0, 3.0, 2.0, 1.0]), returns.shape), used
+
+    monkeypatch.setattr(continual.Run, "select", ranked)
+    folder = continual.train(settings, tmp_path / "run")
+    lines = (folder / "results.jsonl").read_text().splitlines()
+    assert {json.loads(line)["model_size"] for line in lines[-8:]} == {anchors}
 
 
 GRID = np.random.default_rng(1).uniform(-1, 1, (5, 2)).astype(np.float32)
