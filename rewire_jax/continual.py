@@ -142,10 +142,9 @@ class Run:
         before = now.steps
         steps = self.due(before, plan.steps + plan.polishing)
         compiled = plan.program.polish._cache_size()  # type: ignore[attr-defined]
-        state, report = plan.program.polish(
+        state = plan.program.polish(
             plan.members, now.state, stage, plan.steps, before - plan.steps, steps
         )
-        jax.block_until_ready(report)
         now = self.advance(now, state, steps)
         timing = {
             "stage": stage,

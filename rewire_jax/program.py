@@ -25,8 +25,8 @@ class Program(NamedTuple):
         `steps` steps of all environments; the given state is used up.
       consolidate: `(members, state, index, time) -> Learner`, the end of a task's
         interactions, `time` steps of all environments; or None.
-      polish: `(members, state, index, time, done, steps) -> state, Report`, updates
-        from the buffer as in `steps` steps, `done` of which were made before.
+      polish: `(members, state, index, time, done, steps) -> state`, updates from the
+        buffer as in `steps` steps, `done` of which were made before.
       candidates: `(members, learner, index) -> Candidates`, or None.
       finish: `(members, learner, index, Selection or None) -> Learner`.
       policies: `(members, learner) -> policies [members, tasks]`.
@@ -39,7 +39,7 @@ class Program(NamedTuple):
     begin: Callable[..., State]
     chunk: Callable[..., tuple[State, Report]]
     consolidate: Callable[..., sac.Learner] | None
-    polish: Callable[..., tuple[State, Report]]
+    polish: Callable[..., State]
     candidates: Callable[..., Candidates] | None
     finish: Callable[..., sac.Learner]
     policies: Callable[..., Any]
@@ -157,20 +157,12 @@ def build(
         )
         key = task_keys(member, index)[3]
 
-        def step(number, carry):
-            state, report = carry
-            state, metrics = update(
-                jax.random.fold_in(key, number),
-                state,
-                time,
-                number * shape.updates,
-                shape.updates,
-            )
-            metrics = jax.tree.map(jnp.add, report.metrics, metrics)
-            return state, report._replace(updates=report.updates + 1, metrics=metrics)
+        def step(number, state):
+            first = number * shape.updates
+            step_key = jax.random.fold_in(key, number)
+            return update(step_key, state, time, first, shape.updates)[0]
 
-        report = training.empty_report(update, key, state)
-        return jax.lax.fori_loop(done, done + steps, step, (state, report))
+        return jax.lax.fori_loop(done, done + steps, step, state)
 
     def candidates(member, learner, index):
         method = make(spec, member.options)

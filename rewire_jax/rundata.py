@@ -39,7 +39,8 @@ class RunData:
         hours: wall clock of training in all seeds together, with compilation, without
             selection and evaluation.
         rate: training interactions of all seeds per second, without the chunks that
-            compiled; None where there is no other chunk.
+            compiled and without updates that follow a task's last interaction; None
+            where there is no other chunk.
     """
 
     folder: Path
@@ -186,8 +187,8 @@ def _times(
 
     interactions, seconds, last = 0, 0.0, (0, 0)
     rows = _table(path, parse, needed=began)
-    for (stage, x, _), (took, compiled) in sorted(rows.items()):
-        if not compiled:
+    for (stage, x, polishing), (took, compiled) in sorted(rows.items()):
+        if not compiled and not polishing:
             # Rows count from the task's start: a chunk is what came on top.
             interactions += x - (last[1] if last[0] == stage else 0)
             seconds += took

@@ -1,7 +1,6 @@
 """One task's compiled loop: collect, store, update, for a whole population."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -228,13 +227,8 @@ def train(
         )
         return state, report
 
-    report = empty_report(update, key, state)
-    return jax.lax.fori_loop(time, time + steps, step, (state, report))
-
-
-def empty_report(update: Callable[..., Any], key: jax.Array, state: State) -> Report:
-    """A report of nothing, with a place for each metric that `update` gives."""
-    _, shapes = jax.eval_shape(update, key, state, 1, 0, 1)
+    _, shapes = jax.eval_shape(update, key, state, time, time, 1)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     none = jnp.zeros(())
-    return Report(jnp.zeros((), jnp.int32), none, none, none, zeros)
+    report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros)
+    return jax.lax.fori_loop(time, time + steps, step, (state, report))

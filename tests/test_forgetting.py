@@ -215,8 +215,7 @@ def short(method: str, seed: int, seeds: int):
             learner = program.consolidate(members, state, index, 24)
             state = state._replace(learner=learner)
         if prepared.polishing:
-            state, report = program.polish(members, state, index, 24, 0, 2)
-            reports.append(report)
+            state = program.polish(members, state, index, 24, 0, 2)
         learner = program.finish(members, state.learner, index, None)
     return learner, reports, program.policies(members, learner)
 

@@ -62,7 +62,7 @@ def test_rewritten_rows_replace_earlier_ones(tmp_path: Path) -> None:
     assert again.rate == whole.rate
 
 
-def test_hours_and_rate_count_updates_after_the_last_interaction(
+def test_updates_after_the_last_interaction_count_in_hours_but_not_in_the_rate(
     tmp_path: Path,
 ) -> None:
     run = write_run(tmp_path / "run")
@@ -78,4 +78,4 @@ def test_hours_and_rate_count_updates_after_the_last_interaction(
             )
     data = read_run(run)
     assert data.hours == pytest.approx((3 * 63 + 9) / 3600)
-    assert data.rate == pytest.approx(2 * 3 * 750 / 18)
+    assert data.rate == pytest.approx(2 * 3 * 750 / 9)
