@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
 import rewire_jax
 from experiments import suite
 from rewire_jax import published
+from rewire_jax.inspection import most_stored
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Selection, Spec
-from rewire_jax.plan import base_size
+from rewire_jax.plan import base_size, make_spec
 
 # Length of observations in the brax v1 of the paper's runs, where it is known for
 # certain and another than in brax v2.
@@ -70,36 +67,6 @@ class ModelSizes:
     out: Path = suite.RESULTS / "model-sizes"
 
 
-def largest(name: str, spec: Spec, options: Any) -> list[int]:
-    """The most numbers stored in each of two runs over the whole sequence.
-
-    In the one the first of a method's candidates is always the best, in the other the
-    last: what is stored may depend on it.
-    """
-    method = find_method(name).make(spec, options)
-
-    def run(best_first: jax.Array) -> jax.Array:
-        key = jax.random.key(0)
-
-        def one(carry: Any, task: jax.Array) -> tuple[Any, jax.Array]:
-            params, memory = method.start_task(key, *carry, task)
-            selection = None
-            if method.candidates is not None:
-                valid = method.candidates(params, memory, task).valid
-                after = 1.0 + jnp.arange(valid.size)
-                after = jnp.where(best_first, after[::-1], after)
-                selection = Selection(jnp.zeros_like(after), after)
-            carry = method.end_task(params, memory, task, selection)
-            return carry, method.size(*carry)
-
-        _, sizes = jax.lax.scan(one, method.init(key), jnp.arange(spec.tasks))
-        return jnp.max(sizes)
-
-    # What the count does not need is left out of the compiled function.
-    numbers = jax.jit(jax.vmap(run))(jnp.array([True, False]))
-    return [int(number) for number in numbers]
-
-
 def measure(name: str) -> Iterator[dict[str, Any]]:
     """A row for each method and length of observations.
 
@@ -112,14 +79,8 @@ def measure(name: str) -> Iterator[dict[str, Any]]:
     lengths = [environment.observation_size, *FORMER.get(scenario.domain, ())]
     for length, method in itertools.product(lengths, FORMULAS):
         settings = rewire_jax.preset(scenario, method)
-        spec = Spec(
-            observations=length,
-            actions=environment.action_size,
-            hidden=settings.sac.hidden,
-            depth=settings.sac.depth,
-            tasks=settings.tasks,
-        )
-        numbers = largest(method, spec, settings.options.checked())
+        spec = make_spec(settings, environment)._replace(observations=length)
+        numbers = most_stored(method, spec, settings.options.checked())
         yield {
             "scenario": name,
             "method": method,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from rewire_jax import config, networks, population, program, training
 from rewire_jax.config import Settings, require
-from rewire_jax.envs.base import Task
+from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec, count
 from rewire_jax.population import Members
@@ -54,6 +54,17 @@ class Plan(NamedTuple):
         return self.steps * self.settings.envs
 
 
+def make_spec(settings: Settings, environment: Environment) -> Spec:
+    """The static sizes that a method is made from."""
+    return Spec(
+        observations=environment.observation_size,
+        actions=environment.action_size,
+        hidden=settings.sac.hidden,
+        depth=settings.sac.depth,
+        tasks=settings.tasks,
+    )
+
+
 def base_size(spec: Spec) -> int:
     """Numbers in one plain policy, by which model sizes are divided."""
     return count(
@@ -76,13 +87,7 @@ def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
         f"--tasks {settings.tasks}: {scenario.name} has {len(scenario.tasks)}",
     )
     environment = scenario.environment
-    spec = Spec(
-        observations=environment.observation_size,
-        actions=environment.action_size,
-        hidden=settings.sac.hidden,
-        depth=settings.sac.depth,
-        tasks=settings.tasks,
-    )
+    spec = make_spec(settings, environment)
     shape = training.Shape(
         envs=settings.envs,
         updates=settings.updates,
