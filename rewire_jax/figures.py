@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 # Okabe and Ito's palette, told apart with any colour vision; for its yellow, too pale
-# for a line on white, come Tol's wine and grey. Beyond nine the line style changes too.
+# for a line on white, come Tol's wine and grey. The line style changes too: methods can
+# train alike, as FT-1 and FT-N do, and their curves lie on each other.
 _COLOURS = (
     "#0072B2",
     "#009E73",
@@ -32,6 +33,7 @@ _COLOURS = (
     "#D55E00",
 )
 _STYLES = ("-", "--", ":")
+_ALIKE = 5  # lines of one style
 
 
 class Line(NamedTuple):
@@ -109,7 +111,7 @@ def curves(
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
     key = [Line2D([], [], **look(i), label=line.label) for i, line in enumerate(lines)]
-    figure.legend(handles=key, loc="outside right upper", frameon=False)
+    figure.legend(handles=key, loc="outside right center", frameon=False)
     entitle(
         figure,
         title,
@@ -210,7 +212,7 @@ def entitle(figure: Figure, title: str, reading: str) -> None:
 
 def look(i: int) -> dict[str, Any]:
     """Colour and line style of the method at a place, the same in all pictures."""
-    style = _STYLES[i // len(_COLOURS) % len(_STYLES)]
+    style = _STYLES[i // _ALIKE % len(_STYLES)]
     return {"color": _COLOURS[i % len(_COLOURS)], "linestyle": style}
 
 
