@@ -16,13 +16,14 @@ from typing import Any, NamedTuple, TypeVar
 import tyro
 
 import rewire_jax
-from rewire_jax.config import flag, require
+from rewire_jax.config import require
+from rewire_jax.continual import compare
 from rewire_jax.errors import UserError
 from rewire_jax.plan import prepare
 from rewire_jax.published import Figures
 from rewire_jax.report import Report
 from rewire_jax.rundata import read_run
-from rewire_jax.runfolder import HEADER, TABLES, provenance, read_header
+from rewire_jax.runfolder import HEADER, TABLES, provenance
 from rewire_jax.summary import Summary
 
 T = TypeVar("T")
@@ -43,8 +44,6 @@ DOMAINS = {
     "ant": tuple(f"ant/{kind}" for kind in _KINDS),
     "humanoid": ("humanoid/hard",),
 }
-# What a command can ask for; a run that is already there must be the same in it.
-_ASKED = ("scenario", "method", "profile", "backend", "seed", "seeds", "interactions")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,9 +146,9 @@ def train(runs: Sequence[Run], job: Job) -> list[Run]:
     """
     # What is wrong is found before the first run has gone on for hours.
     for run in runs:
+        plan = prepare(run.settings, run.scenario)
         if run.started:
-            _compare(run)
-        prepare(run.settings, run.scenario)
+            compare(run.folder, plan.settings)
     for run in runs if job.train else ():
         if run.finished:
             print(f"{run.folder}: finished before, not run again", file=sys.stderr)
@@ -160,17 +159,6 @@ def train(runs: Sequence[Run], job: Job) -> list[Run]:
     evaluated = [run for run in runs if run.evaluated]
     require(bool(evaluated), "none of the runs has results yet")
     return evaluated
-
-
-def _compare(run: Run) -> None:
-    saved = read_header(run.folder)["settings"]
-    for name in _ASKED:
-        then, now = saved.get(name), getattr(run.settings, name)
-        require(
-            then == now,
-            f"{run.folder} was run with {flag(name)} {then}, not {now}; drop it or "
-            "name another --out",
-        )
 
 
 def reports(runs: Sequence[Run], out: Path) -> list[Report]:

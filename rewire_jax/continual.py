@@ -349,7 +349,7 @@ def train(
     plan = prepare(settings, scenario)
     saved = config.to_json(plan.settings)
     if resume:
-        _compare(runfolder.read_header(folder)["settings"], saved, folder)
+        compare(folder, plan.settings)
     else:
         header = {
             "settings": saved,
@@ -374,8 +374,8 @@ def train(
     return folder
 
 
-def _compare(saved: dict[str, Any], wanted: dict[str, Any], folder: Path) -> None:
-    """Raises `UserError` if a run would be continued with other settings."""
+def compare(folder: Path, settings: Settings) -> None:
+    """Raises `UserError` if a folder's run has other settings, checked ones."""
 
     def flat(data: dict[str, Any]) -> dict[str, Any]:
         rows: dict[str, Any] = {}
@@ -383,7 +383,8 @@ def _compare(saved: dict[str, Any], wanted: dict[str, Any], folder: Path) -> Non
             rows |= flat(value) if isinstance(value, dict) else {name: value}
         return rows
 
-    then, now = flat(saved), flat(wanted)
+    then = flat(runfolder.read_header(folder)["settings"])
+    now = flat(config.to_json(settings))
     changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
     if changed:
         first = changed[0]

@@ -16,12 +16,10 @@ from rich.text import Text
 
 from rewire_jax import figures, tables
 from rewire_jax.errors import UserError
-from rewire_jax.rundata import RunData, read_run
+from rewire_jax.rundata import read_run
 from rewire_jax.scatter import Point, tradeoff
 from rewire_jax.scenarios import SCENARIOS
 from rewire_jax.summary import MEASURES, Comparison, Summary, summarize
-
-__all__ = ["Report", "RunData", "read_run", "to_terminal", "write_report"]
 
 _READING = (
     "Returns are deterministic evaluations. Performance is the score at the end, "

@@ -1,7 +1,11 @@
 """Compiled programs are kept between test runs, in `.jax_cache`."""
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 # Set through the environment, before jax is imported, so that the processes a
 # test starts share the cache. A value the caller has set is left alone.
@@ -14,3 +18,17 @@ os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs() -> Iterator[None]:
+    """Frees a file's compiled programs after it.
+
+    Each takes memory maps, of which Linux grants a process 65,530 by default; XLA
+    crashes where they run out.
+    """
+    yield
+    import jax  # not before the settings above
+
+    jax.clear_caches()
+    gc.collect()

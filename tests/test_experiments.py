@@ -20,6 +20,7 @@ from experiments import (
 from experiments.figure4_tradeoff import Figure4
 from experiments.table1_brax import Table1
 from experiments.table3_ablation import Table3
+from rewire_jax import config
 from rewire_jax.errors import UserError
 from rewire_jax.scenarios import SCENARIOS
 from tests.fake_run import GAP, SCORES, write_run
@@ -43,15 +44,17 @@ def trained(monkeypatch):
         if resume:
             (folder / "settings.json").unlink()
             folder.rename(folder.with_suffix(".before"))
-        facts = vars(settings) | {"method": settings.method}
-        for name in ("sac", "options", "tasks"):
-            facts.pop(name)
+        options = settings.options.checked()
+        facts = config.to_json(dataclasses.replace(settings, options=options))
         write_run(
             folder,
             stages=2 if stop and not resume else 3,
             scores=SCORES * FACTORS.get((settings.method, settings.scenario), 1.0),
-            **facts,
+            **{name: facts[name] for name in ("method", "seeds", "seed", "profile")},
         )
+        head = json.loads((folder / "settings.json").read_text())
+        head["settings"] |= facts
+        (folder / "settings.json").write_text(json.dumps(head))
 
     monkeypatch.setattr(rewire_jax, "train", train)
     return calls
@@ -117,7 +120,7 @@ def test_tables_of_what_there_is(trained, tmp_path):
 def test_another_run_in_the_folder_is_refused(trained, tmp_path):
     job = Table1(scenarios=NAMES[:1], methods=("ft1",), out=tmp_path)
     table1_brax.run(job)
-    with pytest.raises(UserError, match="with --seeds 1, not 3"):
+    with pytest.raises(UserError, match="--seeds was 1, not 3"):
         table1_brax.run(dataclasses.replace(job, seeds=3))
     # Another budget has folders of its own.
     table1_brax.run(dataclasses.replace(job, interactions=20_000))

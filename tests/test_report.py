@@ -11,7 +11,8 @@ from fake_run import BUDGET, SCORES, write_run
 from matplotlib.image import imread
 
 from rewire_jax.errors import UserError
-from rewire_jax.report import Report, read_run, to_terminal, write_report
+from rewire_jax.report import Report, to_terminal, write_report
+from rewire_jax.rundata import read_run
 
 METHODS = ("rewire", "ft1", "sac_n")
 RAW = "Scores are raw returns, not normalised: there is no SAC-N run among them"
