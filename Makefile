@@ -16,7 +16,7 @@ option = $(if $(strip $(2)),--$(1) $(2))
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
-	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS BACKEND OUT where set.'
+	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS BACKEND OUT KEEP where set.'
 
 setup: $(STAMP) ## Make .venv with the pinned versions (does nothing when up to date)
 
