@@ -9,17 +9,17 @@ from dataclasses import dataclass
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.published import Figures
+from rewire_jax import published
 
 # By name of the run: marks for rewiring ("*": without caching), multi-mode and
-# alignment, and what the paper has.
+# alignment.
 ROWS = {
-    "ft_l2": ("", "", "", Figures(0.67, 0.32)),
-    "rewire-uncached": ("*", "", "", Figures(0.76, 0.29)),
-    "rewire-cached": ("✓", "", "", Figures(0.95, 0.24)),
-    "rewire-modes": ("✓", "✓", "", Figures(1.14, 0.22)),
-    "rewire-aligned": ("✓", "", "✓", Figures(1.15, 0.25)),
-    "rewire": ("✓", "✓", "✓", Figures(1.31, 0.21)),
+    "ft_l2": ("", "", ""),
+    "rewire-uncached": ("*", "", ""),
+    "rewire-cached": ("✓", "", ""),
+    "rewire-modes": ("✓", "✓", ""),
+    "rewire-aligned": ("✓", "", "✓"),
+    "rewire": ("✓", "✓", "✓"),
 }
 
 
@@ -64,10 +64,10 @@ def run(job: Table3) -> None:
     found = suite.averages(reports)
     head = ["rewire", "multi-mode", "alignment", "performance", "model size", "paper"]
     table, rows = [head], []
-    for name, (rewire, modes, alignment, paper) in ROWS.items():
-        ours = found.get(name)
+    for name, marks in ROWS.items():
+        ours, paper = found.get(name), published.ABLATION[name]
         cells = suite.text(ours), suite.size(ours), suite.text(paper)
-        table.append([rewire, modes, alignment, *cells])
+        table.append([*marks, *cells])
         rows.append(
             {"run": name} | suite.columns("", ours) | suite.columns("paper_", paper)
         )
