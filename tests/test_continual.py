@@ -19,28 +19,10 @@ from rewire_jax.envs.base import TaskChange
 from rewire_jax.errors import UserError
 from rewire_jax.program import rollout_function
 from rewire_jax.report import write_report
-from rewire_jax.scenarios import Scenario, ScenarioSpec, make_scenario
+from rewire_jax.scenarios import ScenarioSpec, make_scenario
+from tests.tiny import tiny
 
 TABLES = ("results.jsonl", "training.jsonl")
-
-
-def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Settings:
-    if isinstance(scenario, str):
-        scenario = make_scenario(scenario)
-    quick = rewire_jax.preset(scenario, method, "quick")
-    return dataclasses.replace(
-        quick,
-        seeds=2,
-        interactions=640,
-        envs=16,
-        updates=4,
-        warmup=160,
-        eval_episodes=4,
-        selection_episodes=12,
-        report_every=160,
-        checkpoint_every=320,
-        sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
-    )
 
 
 def arguments(settings: Settings, out: Path) -> list[str]:

@@ -1,6 +1,4 @@
-import dataclasses
 import functools
-import json
 import operator
 
 import jax
@@ -8,12 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rewire_jax
 from rewire_jax.errors import UserError
 from rewire_jax.methods import packnet
 from rewire_jax.methods.base import Spec
 from rewire_jax.methods.packnet import FREE, PackNetSettings
-from rewire_jax.scenarios import make_scenario
 
 SPEC = Spec(observations=3, actions=2, hidden=5, depth=2, tasks=4)
 KEY = jax.random.key(0)
@@ -266,33 +262,3 @@ def test_presets_leave_room_for_a_round_of_tasks():
 def test_settings_without_sense_are_refused(values, flag):
     with pytest.raises(UserError, match=flag):
         PackNetSettings(**values).checked()
-
-
-def test_a_run_keeps_what_it_has_learned(tmp_path):
-    quick = rewire_jax.preset(make_scenario("probe/reach"), "packnet", "quick")
-    run = dataclasses.replace(
-        quick,
-        tasks=3,
-        interactions=320,
-        envs=16,
-        updates=4,
-        warmup=80,
-        report_every=160,
-        checkpoint_every=0,
-        options=dataclasses.replace(quick.options, finetune=0.2),
-        sac=dataclasses.replace(quick.sac, hidden=16, depth=2, batch_size=16),
-    )
-    folder = rewire_jax.train(run, tmp_path / "run")
-    places = np.random.default_rng(0).uniform(-1, 1, (9, 2)).astype(np.float32)
-    learned = []
-    for stage in range(3):
-        now = [
-            rewire_jax.load_policy(folder, task=task, stage=stage)(places)
-            for task in range(stage + 1)
-        ]
-        same(now[:-1], learned)
-        learned = now
-    assert not np.allclose(learned[0], learned[1])
-    assert not np.allclose(learned[1], learned[2])
-    rows = (folder / "results.jsonl").read_text().splitlines()
-    assert {json.loads(row)["model_size"] for row in rows} == {2.0}

@@ -1,4 +1,3 @@
-import dataclasses
 import operator
 
 import jax
@@ -6,13 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import rewire_jax
 from rewire_jax import networks
 from rewire_jax.errors import UserError
 from rewire_jax.methods import progressive
 from rewire_jax.methods.base import Spec
 from rewire_jax.methods.progressive import PnnSettings
-from rewire_jax.scenarios import make_scenario
 
 WIDTH, TASKS = 4, 4
 SPEC = Spec(observations=3, actions=2, hidden=7, depth=2, tasks=TASKS)
@@ -268,31 +265,3 @@ def test_presets_and_settings():
     assert progressive.preset("ant/forgetting", 4, "quick").width == 48
     with pytest.raises(UserError, match="--width"):
         PnnSettings(width=0).checked()
-
-
-def test_a_run_keeps_what_it_has_learned(tmp_path):
-    quick = rewire_jax.preset(make_scenario("probe/reach"), "pnn", "quick")
-    run = dataclasses.replace(
-        quick,
-        tasks=3,
-        interactions=320,
-        envs=16,
-        updates=4,
-        warmup=80,
-        report_every=160,
-        checkpoint_every=0,
-        options=PnnSettings(width=8),
-        sac=dataclasses.replace(quick.sac, hidden=16, depth=2, batch_size=16),
-    )
-    folder = rewire_jax.train(run, tmp_path / "run")
-    places = np.random.default_rng(0).uniform(-1, 1, (9, 2)).astype(np.float32)
-    learned = []
-    for stage in range(3):
-        now = [
-            rewire_jax.load_policy(folder, task=task, stage=stage)(places)
-            for task in range(stage + 1)
-        ]
-        same(now[:-1], learned)
-        learned = now
-    assert not np.allclose(learned[0], learned[1])
-    assert not np.allclose(learned[1], learned[2])

@@ -16,6 +16,7 @@ from rewire_jax.methods.subspace import CspSettings
 from rewire_jax.networks import Linear
 from rewire_jax.replay import Batch
 from rewire_jax.scenarios import make_scenario
+from tests.tiny import tiny
 
 OBSERVATIONS, ACTIONS, TASKS = 3, 2, 4
 SPEC = Spec(OBSERVATIONS, ACTIONS, hidden=5, depth=2, tasks=TASKS)
@@ -556,25 +557,15 @@ def test_a_member_is_the_same_alone_and_in_a_crowd():
 # A run
 
 
-def tiny(scenario, **options):
-    quick = rewire_jax.preset(scenario, "csp", "quick")
-    return dataclasses.replace(
-        quick,
-        seeds=2,
-        interactions=640,
-        envs=16,
-        updates=4,
-        warmup=160,
-        eval_episodes=4,
-        selection_episodes=4,
-        options=dataclasses.replace(quick.options, **SEARCH, **options),
-        sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
-    )
+def searching(**options):
+    settings = tiny(method="csp")
+    options = dataclasses.replace(settings.options, **SEARCH, **options)
+    return dataclasses.replace(settings, selection_episodes=4, options=options)
 
 
 def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
     scenario = make_scenario("probe/reach")
-    settings = tiny(scenario, resample_every=7)
+    settings = searching(resample_every=7)
     folder = continual.train(settings, tmp_path / "run")
     lines = (folder / "results.jsonl").read_text().splitlines()
     last = json.loads(lines[-1])["interactions"]
@@ -597,8 +588,7 @@ def test_a_run_keeps_an_anchor_by_its_return(
     improvement, anchors, tmp_path, monkeypatch
 ):
     # Returns are above 0 here, and the newest anchor's proposals always play best.
-    scenario = make_scenario("probe/reach")
-    settings = tiny(scenario, improvement=improvement)
+    settings = searching(improvement=improvement)
     select = continual.Run.select
 
     def ranked(self, now, learner, task, phase):

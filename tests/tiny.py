@@ -1,0 +1,26 @@
+"""Settings of a run of seconds."""
+
+import dataclasses
+
+import rewire_jax
+from rewire_jax.config import Settings
+from rewire_jax.scenarios import Scenario, make_scenario
+
+
+def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Settings:
+    if isinstance(scenario, str):
+        scenario = make_scenario(scenario)
+    quick = rewire_jax.preset(scenario, method, "quick")
+    return dataclasses.replace(
+        quick,
+        seeds=2,
+        interactions=640,
+        envs=16,
+        updates=4,
+        warmup=160,
+        eval_episodes=4,
+        selection_episodes=12,
+        report_every=160,
+        checkpoint_every=320,
+        sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
+    )
