@@ -17,13 +17,12 @@ import tyro
 
 import rewire_jax
 from rewire_jax.config import require
-from rewire_jax.continual import compare
 from rewire_jax.errors import UserError
 from rewire_jax.plan import prepare
 from rewire_jax.published import Figures
 from rewire_jax.report import Report
 from rewire_jax.rundata import read_run
-from rewire_jax.runfolder import HEADER, TABLES, provenance
+from rewire_jax.runfolder import HEADER, TABLES, compare, provenance
 from rewire_jax.summary import Summary
 
 T = TypeVar("T")

@@ -14,7 +14,6 @@ import numpy as np
 from rewire_jax import config, runfolder, standing, training
 from rewire_jax.config import Settings
 from rewire_jax.envs.base import Task
-from rewire_jax.errors import UserError
 from rewire_jax.methods.base import Selection
 from rewire_jax.plan import Plan, base_size, prepare
 from rewire_jax.progress import Progress
@@ -347,12 +346,11 @@ def train(
     """
     folder = Path(out)
     plan = prepare(settings, scenario)
-    saved = config.to_json(plan.settings)
     if resume:
-        compare(folder, plan.settings)
+        runfolder.compare(folder, plan.settings)
     else:
         header = {
-            "settings": saved,
+            "settings": config.to_json(plan.settings),
             "tasks": plan.names,
             "spec": plan.spec._asdict(),
             "episode_length": plan.scenario.environment.episode_length,
@@ -372,23 +370,3 @@ def train(
         while now.stage < plan.settings.tasks:
             now = run.task(now)
     return folder
-
-
-def compare(folder: Path, settings: Settings) -> None:
-    """Raises `UserError` if a folder's run has other settings, checked ones."""
-
-    def flat(data: dict[str, Any]) -> dict[str, Any]:
-        rows: dict[str, Any] = {}
-        for name, value in data.items():
-            rows |= flat(value) if isinstance(value, dict) else {name: value}
-        return rows
-
-    then = flat(runfolder.read_header(folder)["settings"])
-    now = flat(config.to_json(settings))
-    changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
-    if changed:
-        first = changed[0]
-        raise UserError(
-            f"{folder} was started with other settings: {config.flag(first)} was "
-            f"{then.get(first)}, not {now.get(first)}; drop it or name another --out"
-        )

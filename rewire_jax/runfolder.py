@@ -4,7 +4,7 @@ settings.json     settings, task names, network sizes, provenance
 results.jsonl     a row for each evaluation: stage, task, seed
 training.jsonl    a row for each progress report and seed
 timing.jsonl      a row for each progress report: wall-clock seconds
-checkpoints/      `task-03` after each task, `during` in the middle of one
+checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
 """
 
 import importlib.metadata
@@ -19,6 +19,7 @@ from typing import Any
 
 import jax
 
+from rewire_jax import config
 from rewire_jax.errors import UserError
 
 FORMAT = 1
@@ -88,6 +89,26 @@ def read_header(folder: Path) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise UserError(f"{folder} was not written by this version of rewire_jax")
     return header
+
+
+def compare(folder: Path, settings: config.Settings) -> None:
+    """Raises `UserError` if a folder's run has other settings, checked ones."""
+
+    def flat(data: dict[str, Any]) -> dict[str, Any]:
+        rows: dict[str, Any] = {}
+        for name, value in data.items():
+            rows |= flat(value) if isinstance(value, dict) else {name: value}
+        return rows
+
+    then = flat(read_header(folder)["settings"])
+    now = flat(config.to_json(settings))
+    changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
+    if changed:
+        first = changed[0]
+        raise UserError(
+            f"{folder} was started with other settings: {config.flag(first)} was "
+            f"{then.get(first)}, not {now.get(first)}; drop it or name another --out"
+        )
 
 
 def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:

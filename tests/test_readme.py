@@ -5,6 +5,7 @@ import pytest
 
 from experiments.readme import fill
 from rewire_jax.errors import UserError
+from tests.tiny import tiny
 
 ROOT = Path(__file__).parent.parent
 
@@ -60,18 +61,7 @@ def test_the_readmes_own_scenario_and_method_work(tmp_path: Path) -> None:
     )
     exec(next(block for block in blocks if "def shrink" in block), {})
     try:
-        scenario = rewire_jax.make_scenario("probe/reach")
-        settings = rewire_jax.preset(scenario, "shrink", "quick")
-        settings = dataclasses.replace(
-            settings,
-            interactions=320,
-            tasks=2,
-            envs=16,
-            updates=2,
-            warmup=160,
-            eval_episodes=2,
-            sac=dataclasses.replace(settings.sac, hidden=8, batch_size=8),
-        )
+        settings = dataclasses.replace(tiny(method="shrink"), tasks=2)
         rewire_jax.train(settings, tmp_path / "run")
         policy = rewire_jax.load_policy(tmp_path / "run", task=1)
         assert policy(jnp.zeros(2)).shape == (2,)
