@@ -219,6 +219,8 @@ class Run:
                 "return": _finite(score),
                 "reward": _finite(reward),
             }
+            for name, values in report.inspected.items():
+                metrics[name] = _finite(float(values[member]))
             rows.append(row | metrics)
         runfolder.append(self.folder, "training.jsonl", rows)
         timing = {

@@ -67,6 +67,7 @@ class Report(NamedTuple):
       rewards: `[]`, the sum over steps of the mean reward of all environments.
       updates: `[]`, steps with updates.
       metrics: sums over these steps, of each one's last update.
+      inspected: the method's own metrics at the end.
     """
 
     episodes: jax.Array
@@ -74,6 +75,7 @@ class Report(NamedTuple):
     rewards: jax.Array
     updates: jax.Array
     metrics: sac.Metrics
+    inspected: sac.Metrics
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -126,6 +128,18 @@ def collect(
     return Collection(buffer, episodes, label), step
 
 
+def draw_batch(
+    key: jax.Array,
+    state: State,
+    time: jax.Array,
+    environment: Environment,
+    settings: SacSettings,
+) -> replay.Batch:
+    """A batch from a member's buffer of `time` steps."""
+    buffer, length = state.collection.buffer, environment.episode_length
+    return replay.sample(buffer, key, time, settings.batch_size, length)
+
+
 def learn(
     key: jax.Array,
     state: State,
@@ -151,8 +165,7 @@ def learn(
     """
 
     def draw(key):
-        buffer, length = state.collection.buffer, environment.episode_length
-        return replay.sample(buffer, key, time, settings.batch_size, length)
+        return draw_batch(key, state, time, environment, settings)
 
     def one(number, carry):
         learner, metrics = carry
@@ -224,11 +237,19 @@ def train(
             report.rewards + jnp.mean(stepped.reward),
             report.updates + (updates > 0),
             jax.tree.map(jnp.add, report.metrics, metrics),
+            {},
         )
         return state, report
 
     _, shapes = jax.eval_shape(update, key, state, time, time, 1)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     none = jnp.zeros(())
-    report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros)
-    return jax.lax.fori_loop(time, time + steps, step, (state, report))
+    report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros, {})
+    end = time + steps
+    state, report = jax.lax.fori_loop(time, end, step, (state, report))
+    # A key that the next step does not use.
+    batch_key = jax.random.split(jax.random.fold_in(key, end), 3)[2]
+    batch = draw_batch(batch_key, state, end, environment, settings)
+    params, memory = state.learner.params, state.learner.memory
+    inspected = method.inspect(params, memory, batch.observation)
+    return state, report._replace(inspected=inspected)

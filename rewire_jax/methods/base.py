@@ -109,6 +109,8 @@ class Method(NamedTuple):
       penalty: `(key, params, memory, context, observation, (mean, log_std)) ->
         loss, metrics`, added to SAC's policy loss; the pair is what
         `distribution` gave for the same arguments.
+      inspect: `(params, memory, observation) -> metrics`, computed from a batch once
+        a progress report.
       adjust_updates: `(updates, memory) -> updates`, after the optimiser.
       critic_input: `(context, observation) -> [..., observations + extra]`, what
         the critics see beside the action.
@@ -139,6 +141,7 @@ class Method(NamedTuple):
         jnp.zeros(()),
         {},
     )
+    inspect: Callable[[Params, Memory, jax.Array], dict[str, jax.Array]] = lambda *_: {}
     adjust_updates: Callable[[Params, Memory], Params] = lambda updates, memory: updates
     critic_input: Callable[[Context, jax.Array], jax.Array] = (
         lambda context, observation: observation

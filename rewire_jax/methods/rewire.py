@@ -297,6 +297,16 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
 
         return Candidates(jax.vmap(policy)(params.scores), jnp.arange(places) < modes)
 
+    def inspect(params, memory, observation):
+        # Without noise and dropout, unlike the distillation.
+        policies, valid = candidates(params, memory, memory.learned)
+        gaussians = jax.vmap(networks.mlp_policy, (0, None))(policies, observation)
+        against = jax.vmap(gaussian_kl, (None, 0))
+        pairs = jnp.mean(jax.vmap(against, (0, None))(gaussians, gaussians), axis=-1)
+        # That of a mode with itself is 0.
+        total = jnp.sum(jnp.where(valid[:, None] & valid, pairs, 0.0))
+        return {"mode_divergence": total / jnp.maximum(modes * (modes - 1), 1)}
+
     def end_task(params, memory, task, selection):
         order = jnp.argsort(params.scores[0], axis=-1)
         failed = jnp.asarray(False)
@@ -351,6 +361,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         context=context,
         distribution=distribution,
         penalty=penalty,
+        inspect=inspect,
         adjust_updates=adjust_updates,
         candidates=candidates,
         baseline=True,
