@@ -54,6 +54,7 @@ class Job:
       seeds: members of each run.
       seed: of the first member.
       interactions: of training for each task; 0 takes the profile's.
+      tasks: of the sequence that are trained; 0 takes the profile's number.
       backend: physics backend.
       train: otherwise report on the runs that there are, as far as they have come.
     """
@@ -62,13 +63,15 @@ class Job:
     seeds: int = 1
     seed: int = 0
     interactions: int = 0
+    tasks: int = 0
     backend: str = "positional"
     train: bool = True
 
     def name(self, what: str) -> str:
         """Name of a folder for something made with this profile and budget."""
         name = f"{what.replace('/', '-')}-{self.profile}"
-        return f"{name}-{self.interactions}" if self.interactions else name
+        name += f"-{self.interactions}" if self.interactions else ""
+        return name + (f"-tasks-{self.tasks}" if self.tasks else "")
 
     def run(
         self, scenario: rewire_jax.Scenario, method: str, folder: Path, **options: Any
@@ -80,6 +83,7 @@ class Job:
             seeds=self.seeds,
             seed=self.seed,
             interactions=self.interactions or settings.interactions,
+            tasks=self.tasks or settings.tasks,
             options=replace(settings.options, **options),
         )
         return Run(folder, scenario, settings)

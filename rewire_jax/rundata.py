@@ -1,17 +1,16 @@
 """Reads the result files of a run folder, finished or not, into arrays."""
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.errors import UserError
+from rewire_jax.jsonlines import index, number, reason, table, text
 
-_T = TypeVar("_T")
 Array = NDArray[np.float64]
 _NEEDED = ("scenario", "method", "profile", "backend", "interactions")
 
@@ -86,7 +85,7 @@ def read_run(folder: str | Path) -> RunData:
     """
     folder = Path(folder)
     settings, tasks, provenance, episode_length = _head(folder / "settings.json")
-    results = _table(folder / "results.jsonl", lambda row: _result(row, len(tasks)))
+    results = table(folder / "results.jsonl", lambda row: _result(row, len(tasks)))
     if not results:
         raise UserError(f"{folder / 'results.jsonl'} holds no results yet")
     seeds = sorted({seed for _, _, seed in results})
@@ -101,6 +100,7 @@ def read_run(folder: str | Path) -> RunData:
     finished = int(np.cumprod(whole)[1:].sum())
     spent = [row["interactions"] for row in results.values()]
     began = finished > 0
+    rewards = _curve(folder, len(tasks), place, began, "reward")
     hours, rate = _times(folder / "timing.jsonl", len(tasks), len(seeds), began)
     return RunData(
         folder=folder,
@@ -117,24 +117,36 @@ def read_run(folder: str | Path) -> RunData:
         training=max(training for training, _ in spent),
         selection=max(selection for _, selection in spent),
         episode_length=episode_length,
-        curve=_curve(
-            folder / "training.jsonl", len(tasks), place, began, episode_length
-        ),
+        curve=tuple((x, values * episode_length) for x, values in rewards),
         hours=hours,
         rate=rate,
     )
 
 
+def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
+    """A value of a run's progress reports, in the shape of `RunData.curve`.
+
+    Args:
+        run: as read.
+        name: of the value.
+
+    Raises:
+        UserError: the run does not report it, or its file is damaged.
+    """
+    place = {seed: i for i, seed in enumerate(run.seeds)}
+    return _curve(run.folder, len(run.tasks), place, run.finished > 0, name)
+
+
 def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any], int]:
     """Settings, tasks, provenance and episode length from `settings.json`."""
     try:
-        head = json.loads(_text(path))
+        head = json.loads(text(path))
         settings, provenance = dict(head["settings"]), dict(head["provenance"])
         tasks = tuple(str(name) for name in head["tasks"])
         episode_length = int(head["episode_length"])
         missing = [name for name in _NEEDED if name not in settings]
     except (ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path} is damaged ({_reason(error)})") from None
+        raise UserError(f"{path} is damaged ({reason(error)})") from None
     if missing or not tasks:
         raise UserError(f"{path} lacks {', '.join(missing) or 'tasks'}")
     return settings, tasks, provenance, episode_length
@@ -142,10 +154,10 @@ def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any], 
 
 def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str, Any]]:
     """Key (stage, task, seed) and checked values of a row of `results.jsonl`."""
-    stage, task = _index(row, "stage", -1, tasks), _index(row, "task", 0, tasks)
+    stage, task = index(row, "stage", -1, tasks), index(row, "task", 0, tasks)
     spent = row["interactions"]
     return (stage, task, int(row["seed"])), {
-        "return": _number(row["return"]),
+        "return": number(row["return"]),
         "diverged": bool(row["diverged"]),
         "model_size": float(row["model_size"]),
         "interactions": (int(spent["training"]), int(spent["selection"])),
@@ -153,24 +165,24 @@ def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str,
 
 
 def _curve(
-    path: Path, tasks: int, place: dict[int, int], began: bool, episode_length: int
+    folder: Path, tasks: int, place: dict[int, int], began: bool, name: str
 ) -> tuple[tuple[Array, Array], ...]:
-    """Training rewards per stage, see `RunData.curve`."""
+    """A value of the progress reports per stage, see `RunData.curve`."""
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
-        at = _index(row, "stage", 0, tasks), int(row["interactions"])
-        return (*at, place[row["seed"]]), _number(row["reward"]) * episode_length
+        at = index(row, "stage", 0, tasks), int(row["interactions"])
+        return (*at, place[row["seed"]]), number(row[name])
 
-    rows = _table(path, parse, needed=began)
+    rows = table(folder / "training.jsonl", parse, needed=began)
     curve = []
     for stage in range(tasks):
         points = sorted({key[1] for key in rows if key[0] == stage})
         column = {x: i for i, x in enumerate(points)}
-        returns = np.full((len(place), len(points)), np.nan)
+        values = np.full((len(place), len(points)), np.nan)
         for (at, x, seed), value in rows.items():
             if at == stage:
-                returns[seed, column[x]] = value
-        curve.append((np.array(points, np.float64), returns))
+                values[seed, column[x]] = value
+        curve.append((np.array(points, np.float64), values))
     return tuple(curve)
 
 
@@ -180,13 +192,13 @@ def _times(
     """Hours and rate, see `RunData`."""
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[float, bool]]:
-        at = _index(row, "stage", 0, tasks), int(row["interactions"])
+        at = index(row, "stage", 0, tasks), int(row["interactions"])
         # Updates after a task's last interaction have reports of their own.
         key = (*at, int(row.get("polishing", 0)))
         return key, (float(row["seconds"]), bool(row["compile"]))
 
     interactions, seconds, last = 0, 0.0, (0, 0)
-    rows = _table(path, parse, needed=began)
+    rows = table(path, parse, needed=began)
     for (stage, x, polishing), (took, compiled) in sorted(rows.items()):
         if not compiled and not polishing:
             # Rows count from the task's start: a chunk is what came on top.
@@ -195,50 +207,3 @@ def _times(
         last = (stage, x)
     hours = sum(took for took, _ in rows.values()) / 3600
     return hours, seeds * interactions / seconds if seconds > 0 else None
-
-
-def _table(
-    path: Path,
-    parse: Callable[[dict[str, Any]], tuple[tuple[int, ...], _T]],
-    *,
-    needed: bool = True,
-) -> dict[tuple[int, ...], _T]:
-    """Rows of a JSON-lines file by key; later rows replace earlier ones."""
-    if not needed and not path.exists():
-        return {}
-    lines = _text(path).split("\n")
-    table = {}
-    # What follows the last line break is empty, or a line that was cut.
-    for number, line in enumerate(lines[:-1], 1):
-        try:
-            key, value = parse(json.loads(line))
-        except (ValueError, TypeError, KeyError) as error:
-            reason = _reason(error)
-            raise UserError(f"{path}, line {number} is damaged ({reason})") from None
-        table[key] = value
-    return table
-
-
-def _text(path: Path) -> str:
-    try:
-        # A crash may cut inside a character; JSON then refuses the line as it should.
-        return path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:
-        raise UserError(f"{path} is missing: not the folder of a run") from None
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
-
-
-def _index(row: dict[str, Any], name: str, low: int, high: int) -> int:
-    value = int(row[name])
-    if not low <= value < high:
-        raise ValueError(f"{name} {value} is not in {low} to {high - 1}")
-    return value
-
-
-def _number(value: float | None) -> float:
-    return np.nan if value is None else float(value)
-
-
-def _reason(error: Exception) -> str:
-    return f"no {error}" if isinstance(error, KeyError) else str(error)

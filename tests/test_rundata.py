@@ -7,7 +7,7 @@ import pytest
 from fake_run import replace_line, write_run
 
 from rewire_jax.errors import UserError
-from rewire_jax.rundata import read_run
+from rewire_jax.rundata import read_progress, read_run
 
 
 def test_cut_last_lines_are_ignored(tmp_path: Path) -> None:
@@ -79,3 +79,13 @@ def test_updates_after_the_last_interaction_count_in_hours_but_not_in_the_rate(
     data = read_run(run)
     assert data.hours == pytest.approx((3 * 63 + 9) / 3600)
     assert data.rate == pytest.approx(2 * 3 * 750 / 9)
+
+
+def test_any_value_of_the_progress_reports_can_be_read(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path / "run"))
+    read = read_progress(run, "reward")
+    for (x, values), (same, returns) in zip(read, run.curve, strict=True):
+        np.testing.assert_array_equal(x, same)
+        np.testing.assert_allclose(values * run.episode_length, returns)
+    with pytest.raises(UserError, match="no 'fame'"):
+        read_progress(run, "fame")
