@@ -100,6 +100,7 @@ def read_run(folder: str | Path) -> RunData:
     finished = int(np.cumprod(whole)[1:].sum())
     spent = [row["interactions"] for row in results.values()]
     began = finished > 0
+    rewards = _curve(folder, len(tasks), place, began, "reward")
     hours, rate = _times(folder / "timing.jsonl", len(tasks), len(seeds), began)
     return RunData(
         folder=folder,
@@ -116,12 +117,24 @@ def read_run(folder: str | Path) -> RunData:
         training=max(training for training, _ in spent),
         selection=max(selection for _, selection in spent),
         episode_length=episode_length,
-        curve=_curve(
-            folder / "training.jsonl", len(tasks), place, began, episode_length
-        ),
+        curve=tuple((x, values * episode_length) for x, values in rewards),
         hours=hours,
         rate=rate,
     )
+
+
+def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
+    """A value of a run's progress reports, in the shape of `RunData.curve`.
+
+    Args:
+        run: as read.
+        name: of the value.
+
+    Raises:
+        UserError: the run does not report it, or its file is damaged.
+    """
+    place = {seed: i for i, seed in enumerate(run.seeds)}
+    return _curve(run.folder, len(run.tasks), place, run.finished > 0, name)
 
 
 def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any], int]:
@@ -152,24 +165,24 @@ def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str,
 
 
 def _curve(
-    path: Path, tasks: int, place: dict[int, int], began: bool, episode_length: int
+    folder: Path, tasks: int, place: dict[int, int], began: bool, name: str
 ) -> tuple[tuple[Array, Array], ...]:
-    """Training rewards per stage, see `RunData.curve`."""
+    """A value of the progress reports per stage, see `RunData.curve`."""
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
         at = index(row, "stage", 0, tasks), int(row["interactions"])
-        return (*at, place[row["seed"]]), number(row["reward"]) * episode_length
+        return (*at, place[row["seed"]]), number(row[name])
 
-    rows = table(path, parse, needed=began)
+    rows = table(folder / "training.jsonl", parse, needed=began)
     curve = []
     for stage in range(tasks):
         points = sorted({key[1] for key in rows if key[0] == stage})
         column = {x: i for i, x in enumerate(points)}
-        returns = np.full((len(place), len(points)), np.nan)
+        values = np.full((len(place), len(points)), np.nan)
         for (at, x, seed), value in rows.items():
             if at == stage:
-                returns[seed, column[x]] = value
-        curve.append((np.array(points, np.float64), returns))
+                values[seed, column[x]] = value
+        curve.append((np.array(points, np.float64), values))
     return tuple(curve)
 
 
