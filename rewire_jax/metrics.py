@@ -7,6 +7,8 @@ are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
 Statistical Precipice" (NeurIPS 2021).
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
@@ -124,15 +126,21 @@ def interquartile_mean(values: ArrayLike) -> Scores:
 
 
 def stratified_bootstrap(
-    scores: ArrayLike, *, level: float = 0.95, resamples: int = 10_000, seed: int = 0
+    scores: ArrayLike,
+    of: Callable[[Scores], Scores] = interquartile_mean,
+    *,
+    level: float = 0.95,
+    resamples: int = 10_000,
+    seed: int = 0,
 ) -> tuple[float, float] | None:
-    """Percentile interval of the interquartile mean over all seeds and tasks.
+    """Percentile interval of a value over all seeds and tasks.
 
     Every task is a stratum: its seeds are drawn anew, with replacement, apart from
     those of the other tasks.
 
     Args:
         scores: `[seeds, tasks]`.
+        of: the value, from `[..., n]` to `[...]`.
         level: how probable the interval is to hold the value.
         resamples: how often all is drawn.
         seed: of the drawing: the same scores always give the same interval.
@@ -146,7 +154,7 @@ def stratified_bootstrap(
 
     def statistic(*tasks: Scores, axis: int) -> Scores:
         # scipy resamples along the last axis, whatever stands before it.
-        return interquartile_mean(np.concatenate(tasks, axis=axis))
+        return of(np.concatenate(tasks, axis=axis))
 
     interval = stats.bootstrap(
         tuple(scores.T),

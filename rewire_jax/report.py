@@ -1,7 +1,6 @@
 """Tables, pictures and a result file of one or more runs, from their files alone."""
 
 import io
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -172,25 +171,38 @@ def _reading(comparison: Comparison) -> Iterator[str]:
         yield _PAPER
 
 
-def _title(summaries: Sequence[Summary]) -> str:
-    settings = summaries[0].run.settings
+def heading(subject: str, settings: dict[str, Any], tasks: int, members: str) -> str:
+    """A title that says what was run, and with what budget.
+
+    Args:
+        subject: what the title begins with.
+        settings: of the run.
+        tasks: of the sequence that it has.
+        members: how many seeds or configurations.
+    """
     budget, paper = int(settings["interactions"]), settings.get("paper_interactions")
-    spec, tasks = SCENARIOS.get(settings["scenario"]), len(summaries[0].run.tasks)
+    spec = SCENARIOS.get(settings["scenario"])
     whole = len(spec.changes) * spec.repeats if spec else tasks
-    counts = sorted({len(summary.run.seeds) for summary in summaries})
-    seeds = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
     parts = [
-        f"{settings['scenario']}: {settings['profile']} profile",
+        f"{subject}: {settings['profile']} profile",
         f"{tasks} of {whole} tasks" if tasks < whole else f"{tasks} tasks",
         f"{budget:,} interactions a task",
         f"{settings['backend']} backend",
-        f"{seeds} seed{'' if counts[-1] == 1 else 's'}",
+        members,
     ]
     if paper is not None and budget < int(paper):
         parts.append(f"reduced budget (paper: {int(paper):,})")
     elif paper is None and settings["profile"] != "paper":
         parts.append("reduced budget")
     return ", ".join(parts)
+
+
+def _title(summaries: Sequence[Summary]) -> str:
+    run = summaries[0].run
+    counts = sorted({len(summary.run.seeds) for summary in summaries})
+    seeds = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+    members = f"{seeds} seed{'' if counts[-1] == 1 else 's'}"
+    return heading(run.settings["scenario"], run.settings, len(run.tasks), members)
 
 
 def _notes(comparison: Comparison) -> Iterator[str]:
@@ -234,7 +246,7 @@ def _markdown(report: Report) -> str:
     for note in report.notes:
         lines += [f"**{note}**", ""]
     results, costs = tables.results(comparison), tables.costs(comparison)
-    lines += _rows(
+    lines += tables.markdown(
         results.heads + costs.heads[1:],
         [row + more[1:] for row, more in zip(results.rows, costs.rows, strict=True)],
     )
@@ -246,7 +258,7 @@ def _markdown(report: Report) -> str:
         ("Matrix", report.matrix),
     ):
         lines += [f"![{name}]({path.name})", ""]
-    lines += _rows(*tables.tasks(comparison))
+    lines += tables.markdown(*tables.tasks(comparison))
     for summary in report.summaries:
         run, made = summary.run, summary.run.provenance
         seeds = ", ".join(str(seed) for seed in run.seeds)
@@ -255,11 +267,6 @@ def _markdown(report: Report) -> str:
             f"- {summary.label}: `{run.folder}`, seeds {seeds}, {', '.join(facts)}"
         )
     return "\n".join(lines) + "\n"
-
-
-def _rows(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    rule = ["---" if head in tables.WORDS else "---:" for head in heads]
-    return [*(f"| {' | '.join(row)} |" for row in (heads, rule, *rows)), ""]
 
 
 def _json(report: Report) -> str:
@@ -304,13 +311,4 @@ def _json(report: Report) -> str:
         "unit": report.comparison.unit,
         "runs": runs,
     }
-    return json.dumps(_without_nan(data), indent=1, allow_nan=False) + "\n"
-
-
-def _without_nan(data: Any) -> Any:
-    """JSON has no NaN: null stands for it."""
-    if isinstance(data, dict):
-        return {key: _without_nan(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_without_nan(value) for value in data]
-    return None if isinstance(data, float) and not math.isfinite(data) else data
+    return tables.json_text(data)

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,16 @@ from rewire_jax.jsonlines import index, number, reason, table, text
 
 Array = NDArray[np.float64]
 _NEEDED = ("scenario", "method", "profile", "backend", "interactions")
+
+
+class Head(NamedTuple):
+    """What a header says: the first four as in `RunData`, and the whole of it."""
+
+    settings: dict[str, Any]
+    tasks: tuple[str, ...]
+    provenance: dict[str, Any]
+    episode_length: int
+    whole: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -84,8 +94,9 @@ def read_run(folder: str | Path) -> RunData:
         UserError: a file is missing, or damaged elsewhere than in its last line.
     """
     folder = Path(folder)
-    settings, tasks, provenance, episode_length = _head(folder / "settings.json")
-    results = table(folder / "results.jsonl", lambda row: _result(row, len(tasks)))
+    head = read_head(folder / "settings.json")
+    tasks = head.tasks
+    results = table(folder / "results.jsonl", lambda row: result(row, len(tasks)))
     if not results:
         raise UserError(f"{folder / 'results.jsonl'} holds no results yet")
     seeds = sorted({seed for _, _, seed in results})
@@ -101,12 +112,12 @@ def read_run(folder: str | Path) -> RunData:
     spent = [row["interactions"] for row in results.values()]
     began = finished > 0
     rewards = _curve(folder, len(tasks), place, began, "reward")
-    hours, rate = _times(folder / "timing.jsonl", len(tasks), len(seeds), began)
+    hours, rate = times(folder / "timing.jsonl", len(tasks), len(seeds), began)
     return RunData(
         folder=folder,
-        settings=settings,
+        settings=head.settings,
         tasks=tasks,
-        provenance=provenance,
+        provenance=head.provenance,
         seeds=tuple(seeds),
         diverged=tuple(sorted({k[2] for k, row in results.items() if row["diverged"]})),
         before=everything[:, 0],
@@ -116,8 +127,8 @@ def read_run(folder: str | Path) -> RunData:
         # Equal for all seeds but those that stopped early because they diverged.
         training=max(training for training, _ in spent),
         selection=max(selection for _, selection in spent),
-        episode_length=episode_length,
-        curve=tuple((x, values * episode_length) for x, values in rewards),
+        episode_length=head.episode_length,
+        curve=tuple((x, values * head.episode_length) for x, values in rewards),
         hours=hours,
         rate=rate,
     )
@@ -137,22 +148,26 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
     return _curve(run.folder, len(run.tasks), place, run.finished > 0, name)
 
 
-def _head(path: Path) -> tuple[dict[str, Any], tuple[str, ...], dict[str, Any], int]:
-    """Settings, tasks, provenance and episode length from `settings.json`."""
+def read_head(path: Path) -> Head:
+    """The header of a run or a sweep; `UserError` if it is missing or damaged."""
     try:
-        head = json.loads(text(path))
-        settings, provenance = dict(head["settings"]), dict(head["provenance"])
-        tasks = tuple(str(name) for name in head["tasks"])
-        episode_length = int(head["episode_length"])
-        missing = [name for name in _NEEDED if name not in settings]
+        whole = json.loads(text(path))
+        head = Head(
+            settings=dict(whole["settings"]),
+            tasks=tuple(str(name) for name in whole["tasks"]),
+            provenance=dict(whole["provenance"]),
+            episode_length=int(whole["episode_length"]),
+            whole=whole,
+        )
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path} is damaged ({reason(error)})") from None
-    if missing or not tasks:
+    missing = [name for name in _NEEDED if name not in head.settings]
+    if missing or not head.tasks:
         raise UserError(f"{path} lacks {', '.join(missing) or 'tasks'}")
-    return settings, tasks, provenance, episode_length
+    return head
 
 
-def _result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str, Any]]:
+def result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str, Any]]:
     """Key (stage, task, seed) and checked values of a row of `results.jsonl`."""
     stage, task = index(row, "stage", -1, tasks), index(row, "task", 0, tasks)
     spent = row["interactions"]
@@ -186,10 +201,10 @@ def _curve(
     return tuple(curve)
 
 
-def _times(
+def times(
     path: Path, tasks: int, seeds: int, began: bool
 ) -> tuple[float, float | None]:
-    """Hours and rate, see `RunData`."""
+    """Hours and rate, see `RunData`, from a `timing.jsonl`."""
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[float, bool]]:
         at = index(row, "stage", 0, tasks), int(row["interactions"])

@@ -2,6 +2,8 @@
 
 import csv
 import io
+import json
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -23,7 +25,7 @@ class Table(NamedTuple):
 def tasks(comparison: Comparison) -> Table:
     """A row for each run and task, of returns; tasks count from 1."""
     rows = [
-        [summary.label, f"{k} {name}", *map(_spread, task.values())]
+        [summary.label, f"{k} {name}", *map(spread, task.values())]
         for summary in comparison.summaries
         for k, (name, task) in enumerate(
             zip(summary.run.tasks, summary.tasks, strict=True), 1
@@ -48,8 +50,8 @@ def results(comparison: Comparison) -> Table:
     for summary in comparison.summaries:
         row = [
             summary.label,
-            _spread(summary.performance),
-            _interval(summary.iqm),
+            spread(summary.performance),
+            interval(summary.iqm),
             f"{summary.run.model_size:.2f}",
         ]
         for source, theirs in zip(comparison.sources, summary.published, strict=True):
@@ -65,8 +67,8 @@ def costs(comparison: Comparison) -> Table:
     rows = [
         [
             summary.label,
-            _spread(summary.forgetting),
-            _spread(summary.transfer),
+            spread(summary.forgetting),
+            spread(summary.transfer),
             f"{summary.run.training:,}",
             f"{summary.run.selection:,}",
             number(summary.run.hours),
@@ -90,17 +92,17 @@ def costs(comparison: Comparison) -> Table:
 
 def results_csv(comparison: Comparison) -> str:
     """CSV with a row a run and a column a number."""
-    return _csv(
+    return csv_text(
         [
             {"method": summary.label, "unit": comparison.unit}
-            | _columns("performance", summary.performance)
+            | columns("performance", summary.performance)
             | {
                 "iqm": summary.iqm.value,
                 "iqm_low": summary.iqm.low,
                 "iqm_high": summary.iqm.high,
             }
-            | _columns("forgetting", summary.forgetting)
-            | _columns("forward_transfer", summary.transfer)
+            | columns("forgetting", summary.forgetting)
+            | columns("forward_transfer", summary.transfer)
             | run_values(summary)
             | {
                 f"paper_{source.key}_{key}": getattr(theirs, key, None)
@@ -117,13 +119,13 @@ def results_csv(comparison: Comparison) -> str:
 
 def tasks_csv(comparison: Comparison) -> str:
     """CSV with a row for each run and task, of returns; tasks count from 1."""
-    return _csv(
+    return csv_text(
         [
             {"method": summary.label, "task": k, "name": name}
             | {
                 column: value
-                for measure, spread in task.items()
-                for column, value in _columns(measure, spread).items()
+                for measure, over in task.items()
+                for column, value in columns(measure, over).items()
             }
             for summary in comparison.summaries
             for k, (name, task) in enumerate(
@@ -148,26 +150,41 @@ def run_values(summary: Summary) -> dict[str, Any]:
     }
 
 
-def _csv(rows: Sequence[dict[str, Any]]) -> str:
+def csv_text(rows: Sequence[dict[str, Any]]) -> str:
+    """CSV of rows that all have the same columns; None and NaN are left empty."""
     file = io.StringIO()
     writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows(_without_nan(rows))
     return file.getvalue()
 
 
-def _columns(name: str, value: Spread) -> dict[str, Any]:
+def json_text(data: Any) -> str:
+    """JSON, with null for what is not finite."""
+    return json.dumps(_without_nan(data), indent=1, allow_nan=False) + "\n"
+
+
+def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in Markdown, the last one empty."""
+    rule = ["---" if head in WORDS else "---:" for head in heads]
+    return [*(f"| {' | '.join(row)} |" for row in (heads, rule, *rows)), ""]
+
+
+def columns(name: str, value: Spread) -> dict[str, Any]:
+    """Mean and standard deviation as columns of a CSV."""
     return {f"{name}_mean": value.mean, f"{name}_std": value.std}
 
 
-def _spread(value: Spread) -> str:
+def spread(value: Spread) -> str:
+    """Mean ± standard deviation."""
     if value.mean is None or value.std is None:
         return number(value.mean)
     scale = max(abs(value.mean), value.std)
     return f"{number(value.mean, scale)} ± {number(value.std, scale)}"
 
 
-def _interval(value: Interval) -> str:
+def interval(value: Interval) -> str:
+    """A value and the ends of its interval."""
     if value.low is None or value.high is None:
         return number(value.value)
     scale = max(abs(value.low), abs(value.high))
@@ -179,3 +196,11 @@ def _seeds(summary: Summary) -> str:
     run = summary.run
     count = len(run.seeds)
     return f"{run.kept.sum()} of {count}" if run.diverged else str(count)
+
+
+def _without_nan(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {key: _without_nan(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_without_nan(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
