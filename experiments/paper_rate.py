@@ -41,7 +41,7 @@ def measure(name: str, job: PaperRate, folder: Path) -> dict[str, float | str | 
         tasks=1,
         interactions=job.interactions,
         eval_episodes=2,
-        selection_episodes=3,
+        selection_episodes=1,
         report_every=1_280,
         checkpoint_every=0,
     )

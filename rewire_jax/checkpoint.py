@@ -195,8 +195,16 @@ def _orbax() -> Iterator[ocp.Checkpointer]:
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)  # It logs tracebacks when the disk is full.
     try:
-        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as checkpointer:
-            yield checkpointer
+        # Processes that work together write folders of their own, and do not wait.
+        process = jax.process_index()
+        options = ocp.options.MultiprocessingOptions(
+            primary_host=process,
+            active_processes={process},
+            barrier_sync_key_prefix=str(process),
+        )
+        handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
+        with ocp.Checkpointer(handler, multiprocessing_options=options) as orbax:
+            yield orbax
     finally:
         logger.setLevel(level)
 

@@ -33,14 +33,23 @@ def settings(cls: type[T]) -> type[T]:
     vmapped over; all else shapes the program and is static.
     """
     cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+    leaves = list(traced_fields(cls))
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-    leaves = [f.name for f in fields if f.metadata.get("traced", f.type is float)]
     jax.tree_util.register_dataclass(
         cls,
         data_fields=leaves,
         meta_fields=[f.name for f in fields if f.name not in leaves],
     )
     return cls
+
+
+def traced_fields(cls: type) -> dict[str, type]:
+    """Names and types of the settings that may differ between members."""
+    return {
+        field.name: field.type  # type: ignore[misc]
+        for field in dataclasses.fields(cls)
+        if field.metadata.get("traced", field.type is float)
+    }
 
 
 @settings
@@ -62,6 +71,8 @@ class SacSettings:
       policy_delay: critic updates for each update of policy and temperature.
       target_delay: critic updates for each update of the targets.
       time_limit: what a time limit means to the critics.
+      noise_color: of the noise in exploring actions: 0 is white, 1 pink, 2 red
+        (Eberhard et al., ICLR 2023). Updates draw white noise.
     """
 
     lr_policy: float = 3e-4
@@ -78,6 +89,7 @@ class SacSettings:
     policy_delay: int = 2
     target_delay: int = 2
     time_limit: TimeLimit = "terminal"
+    noise_color: float = static(0.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,8 +112,8 @@ class Settings:
       random_interactions: interactions of each task with uniform actions.
       buffer: transitions kept at most.
       eval_episodes: episodes for each task in an evaluation.
-      selection_episodes: episodes of all candidates together when a method
-        chooses among policies by their return; counted as interactions.
+      selection_episodes: episodes of each candidate when a method chooses among
+        policies by their return; counted as interactions.
       report_every: interactions between two progress reports.
       checkpoint_every: interactions between two full checkpoints, 0 for none.
       sac: Soft Actor-Critic's settings.
@@ -123,7 +135,7 @@ class Settings:
     random_interactions: int = 0
     buffer: int = 1_280_000
     eval_episodes: int = 512
-    selection_episodes: int = 128
+    selection_episodes: int = 32
     report_every: int = 20_000
     checkpoint_every: int = 250_000
     sac: SacSettings
@@ -150,6 +162,7 @@ _AT_LEAST: dict[str, float] = {
     "batch_size": 1,
     "policy_delay": 1,
     "target_delay": 1,
+    "noise_color": 0,
 }
 _POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
 _SHARE = ("discount", "target_rate")

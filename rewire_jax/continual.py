@@ -23,7 +23,7 @@ from rewire_jax.standing import Standing
 from rewire_jax.tensorboard import Events
 
 # Streams of randomness beside training's, which is 1.
-_EVALUATION, _SELECTION = 2, 3
+_EVALUATION, _SELECTION, _CHOICE = 2, 3, 4
 
 
 class Stopped(Exception):
@@ -33,12 +33,30 @@ class Stopped(Exception):
 class Run:
     """A run in its folder. Holds paths and compiled functions, no learning state."""
 
-    def __init__(self, plan: Plan, folder: Path, events: Events, progress: Progress):
-        """See `train`."""
+    def __init__(
+        self,
+        plan: Plan,
+        folder: Path,
+        progress: Progress,
+        events: Events | None = None,
+        choosing: bool = False,
+    ):
+        """See `train`.
+
+        Args:
+          plan: of the run.
+          folder: for its tables and checkpoints; it must exist.
+          progress: the display.
+          events: TensorBoard's.
+          choosing: also plays episodes by which members can be chosen, apart from
+            those that are reported.
+        """
         self.plan = plan
         self.folder = folder
-        self.events = events
         self.progress = progress
+        self.events = events or Events(folder, (), False)
+        self.choosing = choosing
+        self.ahead = 0
         self.stopping = False
 
     def start(self) -> Standing:
@@ -47,9 +65,18 @@ class Run:
         self.evaluate(now, -1)
         return now
 
-    def task(self, now: Standing) -> Standing:
-        """Trains what is left of a task, and concludes it."""
+    def task(self, now: Standing, ahead: int) -> Standing:
+        """Trains what is left of a task, and concludes it.
+
+        Args:
+          now: where the run stands.
+          ahead: populations that are still to be trained on a task after this.
+
+        Raises:
+          Stopped: interrupted, and saved.
+        """
         began = clock.perf_counter()
+        self.ahead = ahead
         plan, stage = self.plan, now.stage
         task = jax.tree.map(lambda leaf: leaf[stage], plan.tasks)
         if now.state is None:
@@ -93,26 +120,24 @@ class Run:
             return None, now.selection
         candidates = program.candidates(self.plan.members, learner, now.stage)
         number = candidates.valid.shape[1]
-        # They take turns where there are more rows than candidates.
-        turn = jnp.arange(rows) % number
+        # Rows beyond the candidates are filled, and what happens there is left out.
+        turn = np.arange(rows) % number
         result = program.rollout(
             jax.tree.map(lambda leaf: jnp.stack([leaf] * rows), task),
             jax.tree.map(lambda leaf: leaf[:, turn], candidates.policies),
             self.keys(_SELECTION, 2 * now.stage + phase, rows),
-            self.plan.episodes,
+            self.plan.settings.selection_episodes,
         )
-        used = jnp.sum(result.lengths, axis=2) * candidates.valid[:, turn]
-        means = jnp.mean(result.returns, axis=2)
-        # Not a product with shares: 0 times NaN would spoil all candidates.
-        own = [jnp.mean(means[:, i::number], axis=1) for i in range(number)]
-        return jnp.stack(own, axis=1), now.selection + jnp.sum(used, axis=1)
+        used = result.lengths[:, :number].sum(axis=2) * candidates.valid
+        return result.returns[:, :number].mean(axis=2), now.selection + used.sum(axis=1)
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""
 
         def split(key):
             key = jax.random.fold_in(jax.random.fold_in(key, stream), number)
-            return jax.random.split(key, rows)
+            # Unlike those of a split, the first do not depend on how many there are.
+            return jax.vmap(lambda row: jax.random.fold_in(key, row))(np.arange(rows))
 
         return jax.vmap(split)(self.plan.members.keys)
 
@@ -157,7 +182,7 @@ class Run:
         self.progress.update(
             stage,
             plan.interactions,
-            [None] * len(plan.seeds),
+            [None] * len(plan.crowd),
             rate=None,
             note=f"updates without interactions: {share:.0%}",
         )
@@ -172,10 +197,11 @@ class Run:
     def advance(self, now: Standing, state: training.State, steps: int) -> Standing:
         """The run after these steps; tells of members that were frozen in them."""
         alive = np.array(state.alive)
-        for seed, lost in zip(self.plan.seeds, now.alive & ~alive, strict=True):
-            if lost:
+        lost = now.alive & ~alive
+        for place, member in enumerate(self.plan.crowd):
+            if lost[place]:
                 self.progress.message(
-                    f"seed {seed}: a value is not finite in task {now.stage}; it is "
+                    f"{member.name}: a value is not finite in task {now.stage}; it is "
                     "updated no more, try lower learning rates"
                 )
         return now._replace(steps=now.steps + steps, state=state, alive=alive)
@@ -201,26 +227,27 @@ class Run:
         interactions = now.steps * settings.envs
         returns: list[float | None] = []
         rows = []
-        for member, seed in enumerate(plan.seeds):
-            ended = int(report.episodes[member])
-            score = float(report.returns[member]) / ended if ended else None
-            reward = float(report.rewards[member]) / steps
+        for place, member in enumerate(plan.crowd):
+            ended = int(report.episodes[place])
+            score = float(report.returns[place]) / ended if ended else None
+            reward = float(report.rewards[place]) / steps
             # Few steps end an episode: show what this reward makes in a whole one.
             returns.append(_finite(reward * plan.scenario.environment.episode_length))
-            updates = max(float(report.updates[member]), 1.0)
+            updates = max(float(report.updates[place]), 1.0)
             metrics = {
-                name: _finite(float(total[member]) / updates)
+                name: _finite(float(total[place]) / updates)
                 for name, total in report.metrics.items()
             }
             row = {
                 "stage": stage,
-                "seed": seed,
+                "member": member.number,
+                "seed": member.seed,
                 "interactions": interactions,
                 "return": _finite(score),
                 "reward": _finite(reward),
             }
             for name, values in report.inspected.items():
-                metrics[name] = _finite(float(values[member]))
+                metrics[name] = _finite(float(values[place]))
             rows.append(row | metrics)
         runfolder.append(self.folder, "training.jsonl", rows)
         timing = {
@@ -234,7 +261,7 @@ class Run:
             self.events.training(row, plan.interactions)
         rate = steps * settings.envs * len(rows) / seconds
         # As if steps that only update took as long as the others.
-        steps_left = (plan.steps + plan.polishing) * (settings.tasks - stage)
+        steps_left = (plan.steps + plan.polishing) * (self.ahead + 1)
         left = (steps_left - now.steps) * settings.envs
         self.progress.update(
             stage,
@@ -266,32 +293,40 @@ class Run:
         plan, settings = self.plan, self.plan.settings
         program, members = plan.program, plan.members
         policies = program.policies(members, now.learner)
-        keys = self.keys(_EVALUATION, stage + 1, settings.tasks)
-        result = program.rollout(plan.tasks, policies, keys, settings.eval_episodes)
-        returns = np.asarray(result.returns, np.float64).mean(axis=2)
+
+        def play(stream):
+            keys = self.keys(stream, stage + 1, settings.tasks)
+            result = program.rollout(plan.tasks, policies, keys, settings.eval_episodes)
+            return np.asarray(result.returns, np.float64).mean(axis=2)
+
+        streams = {"return": _EVALUATION}
+        if self.choosing:
+            streams["choice"] = _CHOICE
+        returns = {name: play(stream) for name, stream in streams.items()}
         sizes = np.asarray(program.size(members, now.learner))
         rows = [
             {
                 "stage": stage,
                 "task": index,
                 "name": plan.names[index],
-                "seed": seed,
-                "return": _finite(float(returns[member, index])),
+                "member": member.number,
+                "seed": member.seed,
                 "episodes": settings.eval_episodes,
                 "interactions": {
                     "training": (stage + 1) * plan.interactions,
-                    "selection": int(now.selection[member]),
+                    "selection": int(now.selection[place]),
                 },
-                "diverged": not bool(now.alive[member]),
-                "model_size": int(sizes[member]) / base_size(plan.spec),
+                "diverged": not bool(now.alive[place]),
+                "model_size": int(sizes[place]) / base_size(plan.spec),
             }
-            for member, seed in enumerate(plan.seeds)
+            | {name: _finite(float(x[place, index])) for name, x in returns.items()}
+            for place, member in enumerate(plan.crowd)
             for index in range(settings.tasks)
         ]
         runfolder.append(self.folder, "results.jsonl", rows)
         for row in rows:
             self.events.evaluation(row)
-        return returns
+        return returns["return"][: len(plan.crowd)]
 
 
 def _finite(value: float | None) -> float | None:
@@ -300,7 +335,7 @@ def _finite(value: float | None) -> float | None:
 
 
 @contextmanager
-def _interruptible(run: Run) -> Iterator[None]:
+def interruptible(run: Run) -> Iterator[None]:
     """Ctrl-C once: stop after the running chunk and save. Twice: stop at once."""
 
     def handle(number: int, frame: Any) -> None:
@@ -362,13 +397,14 @@ def train(
     label = f"{settings.method} on {settings.scenario}"
     with ExitStack() as stack:
         display = stack.enter_context(
-            progress(plan.names, plan.interactions, plan.seeds, label)
+            progress(plan.names, plan.interactions, [m.name for m in plan.crowd], label)
         )
-        events = stack.enter_context(Events(folder, plan.seeds, tensorboard))
-        run = Run(plan, folder, events, display)
-        stack.enter_context(_interruptible(run))
+        seeds = [member.seed for member in plan.crowd]
+        events = stack.enter_context(Events(folder, seeds, tensorboard))
+        run = Run(plan, folder, display, events)
+        stack.enter_context(interruptible(run))
         now = standing.restore(folder, plan, display.message) if resume else None
         now = now or run.start()
         while now.stage < plan.settings.tasks:
-            now = run.task(now)
+            now = run.task(now, plan.settings.tasks - now.stage - 1)
     return folder

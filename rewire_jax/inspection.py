@@ -106,18 +106,18 @@ def evaluate(
     params, memory = items["policy"]
     learner = plan.program.init(plan.members)._replace(params=params, memory=memory)
     policies = plan.program.policies(plan.members, learner)
-    keys = jax.random.split(jax.random.key(seed), (len(plan.seeds), len(plan.names)))
+    keys = jax.random.split(jax.random.key(seed), (plan.places, len(plan.names)))
     result = plan.program.rollout(plan.tasks, policies, keys, episodes)
     returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
     return [
         {
             "task": task,
             "name": name,
-            "seed": member_seed,
-            "return": float(returns[member, task].mean()),
-            "std": float(returns[member, task].std()),
-            "steps": int(lengths[member, task].sum()),
+            "seed": member.seed,
+            "return": float(returns[place, task].mean()),
+            "std": float(returns[place, task].std()),
+            "steps": int(lengths[place, task].sum()),
         }
-        for member, member_seed in enumerate(plan.seeds)
+        for place, member in enumerate(plan.crowd)
         for task, name in enumerate(plan.names)
     ]

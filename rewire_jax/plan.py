@@ -1,17 +1,19 @@
 """A run's plan: settings checked, sizes derived, functions built."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from rewire_jax import config, networks, population, program, training
 from rewire_jax.config import Settings, require
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec, count
-from rewire_jax.population import Members
+from rewire_jax.population import Member, Members
 from rewire_jax.program import Program
 from rewire_jax.scenarios import Scenario, make_scenario
 
@@ -24,14 +26,14 @@ class Plan(NamedTuple):
       scenario: as it was made.
       tasks: of the sequence that is run, stacked on a leading axis.
       names: of these tasks.
-      seeds: of the members.
+      crowd: the members.
       steps: steps of all environments in a task.
       polishing: after these, steps that only update from the buffer.
-      rows: candidates rolled out side by side, each perhaps several times; 0 where
-        nothing is to be chosen.
-      episodes: in each row.
+      rows: places for candidates that are rolled out side by side; 0 where nothing is
+        to be chosen.
       spec: sizes of the networks and of the sequence.
-      members: what tells the members apart.
+      members: the same, stacked; fillers behind them make up the numbers.
+      mesh: the devices.
       program: the compiled functions.
     """
 
@@ -39,14 +41,19 @@ class Plan(NamedTuple):
     scenario: Scenario
     tasks: Task
     names: tuple[str, ...]
-    seeds: tuple[int, ...]
+    crowd: tuple[Member, ...]
     steps: int
     polishing: int
     rows: int
-    episodes: int
     spec: Spec
     members: Members
+    mesh: Mesh
     program: Program
+
+    @property
+    def places(self) -> int:
+        """Length of the members' axis."""
+        return len(self.members.keys)
 
     @property
     def interactions(self) -> int:
@@ -72,8 +79,20 @@ def base_size(spec: Spec) -> int:
     )
 
 
-def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
+def prepare(
+    settings: Settings,
+    scenario: Scenario | None = None,
+    crowd: Sequence[Member] = (),
+    places: int = 0,
+) -> Plan:
     """Checks the settings and builds what they describe; compiles nothing.
+
+    Args:
+      settings: of the run.
+      scenario: one of your own; otherwise made from the settings.
+      crowd: the members, in place of one for each seed; their settings may differ
+        from the run's in traced numbers, and are not checked here.
+      places: for members; those beyond the crowd are filled.
 
     Raises:
       UserError: a setting makes no sense.
@@ -95,21 +114,25 @@ def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
         random=settings.random_interactions // settings.envs,
         transitions=min(settings.interactions, settings.buffer) // settings.envs,
     )
-    seeds = tuple(range(settings.seed, settings.seed + settings.seeds))
     sequence = scenario.tasks[: settings.tasks]
-    members = population.members([(settings.sac, settings.options)], seeds)
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    crowd = crowd or population.cross([(settings.sac, settings.options)], seeds)
+    filled = [*crowd, *[crowd[0]] * (places - len(crowd))]
+    mesh = population.mesh(len(filled))
+    members = population.place(population.stack(filled), mesh)
     # Its numbers do not matter; runs that differ in them alone share the program.
     example = jax.tree.map(lambda _: 0.0, settings.options)
-    built = program.build(environment, entry.make, spec, shape, example)
+    built = program.build(environment, entry.make, spec, shape, example, mesh)
     method = entry.make(spec, settings.options)
-    rows, episodes = _selection(settings, built, members)
+    number, rows = _selection(settings, built, members)
     budget = settings.interactions
     if method.in_budget:
-        budget -= rows * episodes * environment.episode_length
+        played = number * settings.selection_episodes
+        budget -= played * environment.episode_length
         require(
             budget >= settings.warmup + settings.envs,
             f"--interactions {settings.interactions} must also pay for "
-            f"{rows * episodes} episodes of choosing between policies: raise it, or "
+            f"{played} episodes of choosing between policies: raise it, or "
             "lower --selection-episodes or --warmup",
         )
     return Plan(
@@ -117,25 +140,23 @@ def prepare(settings: Settings, scenario: Scenario | None = None) -> Plan:
         scenario=scenario,
         tasks=jax.tree.map(lambda *x: jnp.stack(x), *[t.data for t in sequence]),
         names=tuple(task.name for task in sequence),
-        seeds=seeds,
+        crowd=tuple(crowd),
         steps=budget // settings.envs,
         polishing=-(-int(method.offline * settings.interactions) // settings.updates),
         rows=rows,
-        episodes=episodes,
         spec=spec,
         members=members,
+        mesh=mesh,
         program=built,
     )
 
 
 def _selection(settings: Settings, built: Program, members: Members) -> tuple[int, int]:
-    """Rows of a selection, and the episodes in each."""
+    """How many candidates there are, and the rows to play them in."""
     if built.candidates is None or not settings.selection_episodes:
         return 0, 0
     learner = jax.eval_shape(built.init, members)
     number = jax.eval_shape(built.candidates, members, learner, 0).valid.shape[1]
-    # In as many rows as an evaluation has tasks, both can be one compiled function.
-    rows = max(number, settings.tasks)
-    if rows > settings.selection_episodes:
-        rows = number
-    return rows, max(settings.selection_episodes // rows, 1)
+    # Some rows for nothing, where that lets an evaluation's compiled function serve.
+    same = settings.selection_episodes == settings.eval_episodes
+    return number, max(number, settings.tasks) if same else number

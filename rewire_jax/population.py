@@ -1,12 +1,34 @@
-"""Members of a population: configurations times seeds, as stacked pytrees."""
+"""Members of a population: configurations times seeds, and where they live."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 from rewire_jax.config import SacSettings
+
+_AXIS = "members"
+
+
+class Member(NamedTuple):
+    """One member.
+
+    Attributes:
+      number: its own in the run or sweep.
+      name: for people.
+      seed: all its randomness follows from it.
+      sac: SAC's settings.
+      options: the method's settings.
+    """
+
+    number: int
+    name: str
+    seed: int
+    sac: SacSettings
+    options: Any
 
 
 class Members(NamedTuple):
@@ -23,23 +45,64 @@ class Members(NamedTuple):
     options: Any
 
 
-def members(
+def cross(
     configurations: Sequence[tuple[SacSettings, Any]], seeds: Sequence[int]
-) -> Members:
-    """Every configuration with every seed, the seeds of one side by side.
+) -> tuple[Member, ...]:
+    """Every configuration with every seed, the seeds of one side by side."""
+    pairs = [(pair, seed) for pair in configurations for seed in seeds]
+    return tuple(
+        Member(number, f"seed {seed}", seed, *pair)
+        for number, (pair, seed) in enumerate(pairs)
+    )
 
-    The configurations may differ only in their traced numbers.
-    """
 
-    def stack(*leaves):
-        return jnp.repeat(jnp.asarray(leaves, jnp.result_type(*leaves)), len(seeds))
+def stack(crowd: Sequence[Member]) -> Members:
+    """Members side by side; they may differ only in their traced numbers."""
 
     def stacked(settings):
-        return jax.tree.map(stack, *settings)
+        return jax.tree.map(
+            lambda *leaves: jnp.asarray(leaves, jnp.result_type(*leaves)), *settings
+        )
 
-    keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
+    seeds = jnp.asarray([member.seed for member in crowd], jnp.uint32)
     return Members(
-        keys=jnp.tile(keys, len(configurations)),
-        sac=stacked([sac for sac, _ in configurations]),
-        options=stacked([options for _, options in configurations]),
+        keys=jax.vmap(jax.random.key)(seeds),
+        sac=stacked([member.sac for member in crowd]),
+        options=stacked([member.options for member in crowd]),
     )
+
+
+def mesh(members: int) -> Mesh:
+    """As many of this process's devices as can have equal shares of the members."""
+    devices = jax.local_devices()
+    number = next(n for n in range(len(devices), 0, -1) if members % n == 0)
+    return Mesh(devices[:number], (_AXIS,))
+
+
+def place(tree: Any, mesh: Mesh) -> Any:
+    """Spreads a pytree with a leading axis `[members]` over the devices."""
+    return jax.device_put(tree, NamedSharding(mesh, P(_AXIS)))
+
+
+def compiled(
+    function: Callable[..., Any],
+    axes: Sequence[int | None],
+    mesh: Mesh,
+    donate: tuple[int, ...] = (),
+) -> Callable[..., Any]:
+    """A function of whole populations, to be compiled when it is first called.
+
+    Each device computes its own members and hears nothing of the others.
+
+    Args:
+      function: takes and gives `[members]` on a leading axis.
+      axes: for each argument 0, or None where all members share it.
+      mesh: the devices.
+      donate: arguments whose memory the result may take.
+    """
+    shares = tuple(P() if axis is None else P(_AXIS) for axis in axes)
+    # Members vary over devices and counters do not: what loops carry is both.
+    local = jax.shard_map(
+        function, mesh=mesh, in_specs=shares, out_specs=P(_AXIS), check_vma=False
+    )
+    return jax.jit(local, donate_argnums=donate)

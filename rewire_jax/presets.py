@@ -77,7 +77,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         warmup=min(12_800, scenario.interactions // 4),
         sac=_sac(scenario.name),
         options=entry.preset(scenario.name, period, profile),
-        selection_episodes=entry.selection_episodes or 128,
+        selection_episodes=entry.selection_episodes or 32,
     )
     if profile == "paper":
         return paper
@@ -90,7 +90,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         updates=16,
         warmup=min(2_560, interactions // 4),
         eval_episodes=4,
-        selection_episodes=entry.selection_episodes or 4 * period,
+        selection_episodes=entry.selection_episodes or 4,
         report_every=2_560,
         checkpoint_every=12_800,
         # A temperature that falls from 2 at the paper's rate would keep the policy

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
-from rewire_jax import replay, rollout, sac, training
+from rewire_jax import population, replay, rollout, sac, training
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools
 from rewire_jax.training import Collection, Report, Shape, State
@@ -50,7 +51,11 @@ class Program(NamedTuple):
 
 @functools.lru_cache
 def rollout_function(
-    environment: Environment, act: Callable[..., Any], rows: int, count: int
+    environment: Environment,
+    act: Callable[..., Any],
+    rows: int,
+    count: int,
+    mesh: Mesh,
 ) -> Callable[..., rollout.Rollout]:
     """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
 
@@ -61,7 +66,7 @@ def rollout_function(
         assert keys.shape[1] == rows
         return rollout.episodes(environment, act, tasks, policies, keys, count)
 
-    return jax.jit(episodes)
+    return population.compiled(episodes, (None, 0, 0), mesh)
 
 
 @functools.lru_cache
@@ -71,6 +76,7 @@ def build(
     spec: Spec,
     shape: Shape,
     example: Any,
+    mesh: Mesh,
 ) -> Program:
     """The functions of a run; runs alike in all but numbers share them.
 
@@ -80,6 +86,7 @@ def build(
       spec: sizes of the networks and of the sequence.
       shape: sizes of the loop.
       example: one member's method settings, for what is static about the method.
+      mesh: the devices among which the members are shared out.
     """
 
     def init(member):
@@ -182,27 +189,27 @@ def build(
         return jax.vmap(policy)(jnp.arange(spec.tasks))
 
     def rollout_episodes(tasks, policies, keys, count):
-        function = rollout_function(environment, method.act, keys.shape[1], count)
+        rows = keys.shape[1]
+        function = rollout_function(environment, method.act, rows, count, mesh)
         return function(tasks, policies, keys)
 
     def size(member, learner):
         return make(spec, member.options).size(learner.params, learner.memory)
 
+    def over(function, *axes, donate=()):
+        return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
+
     method = make(spec, example)
-    chunk_axes = (0, 0, None, None, None, None)
     return Program(
-        init=jax.jit(jax.vmap(init)),
-        begin=jax.jit(jax.vmap(begin, (0, 0, 0, None, None))),
-        chunk=jax.jit(jax.vmap(chunk, chunk_axes), donate_argnums=1),
-        consolidate=method.consolidate
-        and jax.jit(jax.vmap(consolidate, (0, 0, None, None))),
-        polish=jax.jit(
-            jax.vmap(polish, (0, 0, None, None, None, None)), donate_argnums=1
-        ),
-        candidates=method.candidates and jax.jit(jax.vmap(candidates, (0, 0, None))),
-        finish=jax.jit(jax.vmap(finish, (0, 0, None, 0))),
-        policies=jax.jit(jax.vmap(policies)),
+        init=over(init, 0),
+        begin=over(begin, 0, 0, 0, None, None),
+        chunk=over(chunk, 0, 0, None, None, None, None, donate=(1,)),
+        consolidate=method.consolidate and over(consolidate, 0, 0, None, None),
+        polish=over(polish, 0, 0, None, None, None, None, donate=(1,)),
+        candidates=method.candidates and over(candidates, 0, 0, None),
+        finish=over(finish, 0, 0, None, 0),
+        policies=over(policies, 0, 0),
         rollout=rollout_episodes,
-        size=jax.jit(jax.vmap(size)),
+        size=over(size, 0, 0),
         baseline=method.baseline,
     )

@@ -13,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-_MOST_SEEDS = 6  # with more, their returns are shown as mean and range
+_MOST_NAMES = 6  # with more, their returns are shown as mean and range
 
 
 class Progress:
@@ -25,7 +25,7 @@ class Progress:
     Args:
         tasks: names of the whole sequence.
         total: interactions a task.
-        seeds: in the order of the returns given later.
+        members: their names, in the order of the returns given later.
         label: what is running, such as method and scenario.
         file: where to write, by default the standard error output.
         console: used instead of one made for `file`.
@@ -35,7 +35,7 @@ class Progress:
         self,
         tasks: Sequence[str],
         total: int,
-        seeds: Sequence[int],
+        members: Sequence[str],
         label: str,
         file: TextIO | None = None,
         *,
@@ -43,7 +43,7 @@ class Progress:
     ) -> None:
         self._tasks = tuple(tasks)
         self._total = total
-        self._seeds = tuple(seeds)
+        self._members = tuple(members)
         self._label = label
         self._console = console or Console(file=file or sys.stderr)
         self._live: Live | None = None
@@ -83,9 +83,9 @@ class Progress:
 
         Args:
             stage: index of the task in training.
-            interactions: made in this task, for each seed.
-            returns: latest training return of each seed, None where there is none yet.
-            rate: interactions/s of all seeds together, None where there are none.
+            interactions: made in this task, by each member.
+            returns: latest training return of each member, None where there is none.
+            rate: interactions/s of all members together, None where there are none.
             seconds_left: of the whole run, None where it cannot be told yet.
             note: anything else, such as "evaluating".
         """
@@ -119,7 +119,7 @@ class Progress:
 
         Args:
             stage: index of the task.
-            returns: evaluation return of each seed on this task.
+            returns: evaluation return of each member on this task.
             seconds: what the task took.
         """
         self.message(
@@ -135,17 +135,17 @@ class Progress:
         return f"task {stage + 1} of {len(self._tasks)}, {self._tasks[stage]}"
 
     def _returns(self, returns: Sequence[float | None]) -> str:
-        """One return a seed, or their mean and range."""
-        if len(returns) <= _MOST_SEEDS:
-            pairs = zip(self._seeds, returns, strict=True)
-            return "  ".join(f"seed {seed}: {_number(x)}" for seed, x in pairs)
+        """One return a member, or their mean and range."""
+        if len(returns) <= _MOST_NAMES:
+            pairs = zip(self._members, returns, strict=True)
+            return "  ".join(f"{name}: {_number(x)}" for name, x in pairs)
         known = [x for x in returns if x is not None and math.isfinite(x)]
         if not known:
             return _number(None)
         missing = len(returns) - len(known)
         return (
             f"mean {_number(sum(known) / len(known))}, "
-            f"{_number(min(known))} to {_number(max(known))} in {len(known)} seeds"
+            f"{_number(min(known))} to {_number(max(known))} in {len(known)} members"
             + (f", none in {missing}" if missing else "")
         )
 

@@ -66,19 +66,26 @@ def create(folder: Path, header: Mapping[str, Any]) -> None:
                 "the run there with --resume"
             )
         folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({"format": FORMAT, **header}, indent=1)
-        temporary = folder / f".{HEADER}"
-        temporary.write_text(text + "\n")
-        temporary.rename(folder / HEADER)
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error}") from error
+    write(folder / HEADER, {"format": FORMAT, **header})
 
 
-def read_header(folder: Path) -> dict[str, Any]:
-    """The header of a run.
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes JSON, all of it or nothing; `UserError` if it cannot be written."""
+    try:
+        temporary = path.with_name(f".{path.name}")
+        temporary.write_text(json.dumps(content, indent=1) + "\n")
+        temporary.rename(path)
+    except OSError as error:
+        raise UserError(f"cannot write to {path.parent}: {error}") from error
+
+
+def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
+    """The header of a run, or of a sweep.
 
     Raises:
-      UserError: there is no run, or one of another format.
+      UserError: there is none, one of another format, or of the other kind.
     """
     try:
         header = json.loads((folder / HEADER).read_text())
@@ -88,11 +95,14 @@ def read_header(folder: Path) -> dict[str, Any]:
         raise UserError(f"{folder / HEADER} is damaged: {error}") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise UserError(f"{folder} was not written by this version of rewire_jax")
+    found = header.get("kind", "run")
+    if found != kind:
+        raise UserError(f"{folder} holds a {found}, not a {kind}")
     return header
 
 
-def compare(folder: Path, settings: config.Settings) -> None:
-    """Raises `UserError` if a folder's run has other settings, checked ones."""
+def compare(folder: Path, settings: config.Settings, kind: str = "run") -> None:
+    """Raises `UserError` if a folder's run or sweep has other settings."""
 
     def flat(data: dict[str, Any]) -> dict[str, Any]:
         rows: dict[str, Any] = {}
@@ -100,7 +110,11 @@ def compare(folder: Path, settings: config.Settings) -> None:
             rows |= flat(value) if isinstance(value, dict) else {name: value}
         return rows
 
-    then = flat(read_header(folder)["settings"])
+    saved = read_header(folder, kind)["settings"]
+    if saved.get("method") == settings.method:
+        # What the run's version did not have was as it is by default.
+        saved = config.to_json(config.from_json(saved, type(settings.options)))
+    then = flat(saved)
     now = flat(config.to_json(settings))
     changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
     if changed:

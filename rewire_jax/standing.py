@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax import checkpoint, runfolder
+from rewire_jax import checkpoint, population, runfolder
 from rewire_jax.errors import UserError
 from rewire_jax.plan import Plan
 from rewire_jax.sac import Learner
@@ -46,15 +46,14 @@ class Standing(NamedTuple):
 
 def start(plan: Plan) -> Standing:
     """Before the first task."""
-    members = len(plan.seeds)
     return Standing(
         stage=0,
         steps=0,
         learner=plan.program.init(plan.members),
         state=None,
         before=None,
-        alive=np.ones(members, bool),
-        selection=jnp.zeros(members, jnp.int32),
+        alive=np.ones(plan.places, bool),
+        selection=jnp.zeros(plan.places, jnp.int32),
     )
 
 
@@ -100,6 +99,11 @@ def kept(folder: Path, stage: int | None) -> Path:
     return between[0]
 
 
+def finished(folder: Path, stage: int) -> bool:
+    """Whether what is kept after a stage is there."""
+    return (folder / _FOLDER / _name(stage + 1)).exists()
+
+
 def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | None:
     """The newest standing whose checkpoint is whole, None if there is none.
 
@@ -124,38 +128,68 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | 
 
 def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, int]]:
     program, members = plan.program, plan.members
-    number = len(plan.seeds)
     learner = jax.eval_shape(program.init, members)
-    alive = jax.ShapeDtypeStruct((number,), bool)
-    selection = jax.ShapeDtypeStruct((number,), jnp.int32)
-    like: dict[str, Any] = {"counts": {"alive": alive, "selection": selection}}
+    like: dict[str, Any] = {"counts": _counts(plan)}
     saved = checkpoint.read_metadata(path)["items"]
     if "state" in saved:
         task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-        like["state"] = jax.eval_shape(program.begin, members, learner, alive, 0, task)
+        like["state"] = jax.eval_shape(
+            program.begin, members, learner, like["counts"]["alive"], 0, task
+        )
     else:
         like |= _kept(learner)
     if "before" in saved and program.candidates is not None:
         candidates = jax.eval_shape(program.candidates, members, learner, 0)
         like["before"] = jax.ShapeDtypeStruct(candidates.valid.shape, jnp.float32)
     items, metadata = checkpoint.load(path, like)
-    items = jax.tree.map(jnp.asarray, items)
-    restored = None
     if "policy" in items:
-        params, memory = items["policy"]
-        # The rest of a learner starts anew with the next task.
-        restored = program.init(members)._replace(
-            params=params, memory=memory, critic=items["critic"]
-        )
+        return between(metadata["stage"], items, plan), metadata["tables"]
+    items = population.place(items, plan.mesh)
     return Standing(
         stage=metadata["stage"],
         steps=metadata["steps"],
-        learner=restored,
-        state=items.get("state"),
+        learner=None,
+        state=items["state"],
         before=items.get("before"),
         alive=np.asarray(items["counts"]["alive"]),
         selection=items["counts"]["selection"],
     ), metadata["tables"]
+
+
+def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
+    """What is kept after a stage: items `[members]` for `between`, on the host.
+
+    Raises:
+      CheckpointError: it is missing or damaged.
+    """
+    learner = jax.eval_shape(plan.program.init, plan.members)
+    like = {"counts": _counts(plan)} | _kept(learner)
+    return checkpoint.load(folder / _FOLDER / _name(stage + 1), like)[0]
+
+
+def between(stage: int, items: dict[str, Any], plan: Plan) -> Standing:
+    """The standing before a task, from what is kept after the one before."""
+    items = population.place(items, plan.mesh)
+    params, memory = items["policy"]
+    return Standing(
+        stage=stage,
+        steps=0,
+        # The rest of a learner starts anew with the next task.
+        learner=plan.program.init(plan.members)._replace(
+            params=params, memory=memory, critic=items["critic"]
+        ),
+        state=None,
+        before=None,
+        alive=np.asarray(items["counts"]["alive"]),
+        selection=items["counts"]["selection"],
+    )
+
+
+def _counts(plan: Plan) -> dict[str, Any]:
+    return {
+        "alive": jax.ShapeDtypeStruct((plan.places,), bool),
+        "selection": jax.ShapeDtypeStruct((plan.places,), jnp.int32),
+    }
 
 
 def _kept(learner: Learner) -> dict[str, Any]:

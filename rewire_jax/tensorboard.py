@@ -6,6 +6,8 @@ from typing import Any, Self
 
 from rewire_jax.errors import UserError
 
+_PLACES = ("stage", "member", "seed", "interactions")
+
 
 class Events:
     """Writes rows of the run's tables as scalars."""
@@ -41,7 +43,7 @@ class Events:
         if writer := self._writers.get(row["seed"]):
             step = row["stage"] * interactions + row["interactions"]
             for name, value in row.items():
-                if name not in ("stage", "seed", "interactions") and value is not None:
+                if name not in _PLACES and value is not None:
                     writer.add_scalar(f"training/{name}", value, step)
 
     def evaluation(self, row: Mapping[str, Any]) -> None:

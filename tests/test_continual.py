@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -79,9 +80,9 @@ def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
     assert checkpoints(run) == [f"task-{task:03d}" for task in (1, 2, 3, 4)]
     last = rows(run)[-1]
     assert last["interactions"]["training"] == 4 * 640
-    # Twelve episodes, all modes together, at start and end of each of four tasks.
+    # Two episodes of each of three modes at start and end of each of four tasks.
     steps = make_scenario("probe/reach").environment.episode_length
-    assert last["interactions"]["selection"] == 2 * 4 * 12 * steps
+    assert last["interactions"]["selection"] == 2 * 4 * 3 * 2 * steps
     assert len({row["return"] for row in rows(run)}) > 10
     assert list((run / "tensorboard").glob("seed-*/events*"))
     report = write_report([run], run / "report")
@@ -106,6 +107,17 @@ def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
         assert (folder / name).read_bytes() == (run / name).read_bytes()
     for ours, theirs in zip(leaves(folder, tiny()), leaves(run, tiny()), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_run_may_be_older_than_a_setting(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    header = json.loads((copy / "settings.json").read_text())
+    del header["settings"]["sac"]["noise_color"]
+    (copy / "settings.json").write_text(json.dumps(header))
+    continual.train(tiny(), copy, resume=True)
+    sac = dataclasses.replace(tiny().sac, noise_color=1.0)
+    with pytest.raises(UserError, match=r"--noise-color was 0\.0, not 1\.0"):
+        continual.train(dataclasses.replace(tiny(), sac=sac), copy, resume=True)
 
 
 class _Stop(Exception):
@@ -144,7 +156,7 @@ def test_what_a_method_needs_within_a_task_is_saved(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=8)
+    settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=1)
     whole = continual.train(settings, tmp_path / "whole")
     with monkeypatch.context() as patch:
         stop_after(patch, times, name)
@@ -199,9 +211,10 @@ def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     made = rewire_jax.methods.find_method("rewire").make(
         prepared.spec, prepared.settings.options
     )
-    # Evaluation, and selection: twelve episodes in eight rows. Other tests use them.
+    # Evaluation; selection of each of three modes. Other tests use them, too.
     shared = [
-        rollout_function(scenario.environment, made.act, 8, count) for count in (4, 1)
+        rollout_function(scenario.environment, made.act, *sizes, prepared.mesh)
+        for sizes in ((8, 4), (3, 2))
     ]
     before = [function._cache_size() for function in shared]
     continual.train(settings, tmp_path / "run", scenario=scenario)
@@ -237,7 +250,7 @@ def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
             if (row["stage"], row["task"], row["seed"]) == (3, task, seed)
         ]
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), 4)
-        keys = jax.random.split(jax.random.split(key, 4)[task], 4)
+        keys = jax.random.split(jax.random.fold_in(key, task), 4)
 
         def play(key, policy=policy, data=data):
             state = environment.reset(data, key)

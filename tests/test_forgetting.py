@@ -48,7 +48,7 @@ def settings(method: str) -> Settings:
         warmup=320,
         eval_episodes=episodes,
         # CSP pays for its selection; the others' is one function with the evaluation.
-        selection_episodes=16 if method == "csp" else episodes * len(GOALS),
+        selection_episodes=2 if method == "csp" else episodes,
         report_every=6400,
         checkpoint_every=0,
         sac=dataclasses.replace(
@@ -82,10 +82,13 @@ def play_functions(prepared: plan.Plan) -> dict[str, Callable]:
     act = method.make(prepared.spec, prepared.settings.options).act
     sizes = {
         "evaluation": (len(GOALS), prepared.settings.eval_episodes),
-        "selection": (prepared.rows, prepared.episodes),
+        "selection": (prepared.rows, prepared.settings.selection_episodes),
     }
     environment = prepared.scenario.environment
-    return {n: rollout_function(environment, act, *size) for n, size in sizes.items()}
+    return {
+        name: rollout_function(environment, act, *size, prepared.mesh)
+        for name, size in sizes.items()
+    }
 
 
 def traces(prepared: plan.Plan) -> dict[str, int]:

@@ -26,7 +26,7 @@ def terminal() -> tuple[Console, io.StringIO]:
 
 def test_quiet_without_a_terminal() -> None:
     file = io.StringIO()
-    run(Progress(TASKS, 30_000, [0, 1], "rewire", file))
+    run(Progress(TASKS, 30_000, ["seed 0", "seed 1"], "rewire", file))
     assert file.getvalue() == (
         "seed 1 diverged [and is frozen]\n"
         "rewire: task 2 of 2, moon finished in 0:01:01, "
@@ -35,7 +35,7 @@ def test_quiet_without_a_terminal() -> None:
 
 
 def test_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
-    run(Progress(TASKS, 30_000, [0, 1], "rewire"))
+    run(Progress(TASKS, 30_000, ["seed 0", "seed 1"], "rewire"))
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "task 2 of 2, moon finished" in captured.err
@@ -44,14 +44,22 @@ def test_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
 def test_dumb_terminal_is_quiet() -> None:
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, _environ={"TERM": "dumb"})
-    run(Progress(TASKS, 30_000, [0, 1], "rewire", console=console))
+    run(Progress(TASKS, 30_000, ["seed 0", "seed 1"], "rewire", console=console))
     assert len(file.getvalue().splitlines()) == 2
     assert "\x1b" not in file.getvalue()
 
 
 def test_live_display_shows_all_fields() -> None:
     console, file = terminal()
-    run(Progress(TASKS, 30_000, [3, 4], "rewire on ant/transfer", console=console))
+    run(
+        Progress(
+            TASKS,
+            30_000,
+            ["seed 3", "seed 4"],
+            "rewire on ant/transfer",
+            console=console,
+        )
+    )
     text = file.getvalue()
     for part in (
         "rewire on ant/transfer",
@@ -74,16 +82,18 @@ def test_live_display_shows_all_fields() -> None:
 
 def test_many_seeds_are_abbreviated() -> None:
     console, file = terminal()
-    with Progress(TASKS, 100, range(8), "ft1", console=console) as progress:
+    with Progress(
+        TASKS, 100, [f"seed {i}" for i in range(8)], "ft1", console=console
+    ) as progress:
         progress.update(0, 10, [None] * 8, 1.0)
         progress.update(0, 20, [100.0, 300.0, None, *[200.0] * 5], 1.0)
-    assert "mean 200, 100 to 300 in 7 seeds, none in 1" in file.getvalue()
+    assert "mean 200, 100 to 300 in 7 members, none in 1" in file.getvalue()
     assert "seed 0" not in file.getvalue()
 
 
 def test_display_ends_with_an_error() -> None:
     console, file = terminal()
-    progress = Progress(TASKS, 100, [0], "ft1", console=console)
+    progress = Progress(TASKS, 100, ["seed 0"], "ft1", console=console)
     with pytest.raises(KeyboardInterrupt), progress:
         raise KeyboardInterrupt
     assert file.getvalue().count("\x1b[?25h") == 1

@@ -560,7 +560,7 @@ def test_a_member_is_the_same_alone_and_in_a_crowd():
 def searching(**options):
     settings = tiny(method="csp")
     options = dataclasses.replace(settings.options, **SEARCH, **options)
-    return dataclasses.replace(settings, selection_episodes=4, options=options)
+    return dataclasses.replace(settings, selection_episodes=1, options=options)
 
 
 def test_a_run_keeps_its_budget_and_its_policies(tmp_path):

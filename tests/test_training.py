@@ -40,6 +40,7 @@ OTHER = dataclasses.replace(
     target_rate=0.1,
 )
 SEEDS = (3, 8)
+MESH = population.mesh(1)
 
 
 def options(method, number):
@@ -57,11 +58,13 @@ def configurations(method):
 
 def build(method):
     make = find_method(method).make
-    return compiled.build(SCENARIO.environment, make, SPEC, SHAPE, options(method, 0))
+    return compiled.build(
+        SCENARIO.environment, make, SPEC, SHAPE, options(method, 0), MESH
+    )
 
 
 def crowd(method="ft1"):
-    return population.members(configurations(method), SEEDS)
+    return population.stack(population.cross(configurations(method), SEEDS))
 
 
 def begin(program, members, index=0):
@@ -139,8 +142,8 @@ def same_alone(method, program, state, reports, steps):
     ]
     for number in range(4):
         configuration, seed = divmod(number, len(SEEDS))
-        alone = population.members(
-            [configurations(method)[configuration]], [SEEDS[seed]]
+        alone = population.stack(
+            population.cross([configurations(method)[configuration]], [SEEDS[seed]])
         )
         lonely, lonely_reports = go(program, alone, begin(program, alone), steps)
         near = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
@@ -246,6 +249,54 @@ def test_the_first_actions_are_uniform_and_do_not_ask_the_policy(program, starte
     assert stats.kstest(uniform, stats.uniform(-1, 2).cdf).pvalue > 1e-4
     assert (actions[1][:, RANDOM:] > 0.99).all()
     assert (actions[0][:, RANDOM:] < 0.99).any()
+
+
+@pytest.fixture(scope="module")
+def pink():
+    """The crowd, exploring with pink noise."""
+    members = crowd()
+    return members._replace(sac=dataclasses.replace(members.sac, noise_color=1.0))
+
+
+def test_chunks_do_not_matter_to_pink_noise(program, started, whole, pink):
+    state, _ = go(program, pink, started, [25])
+    parts, _ = go(program, pink, started, [5, 1, 4, 10, 5])
+    equal(state, parts)
+    white, coloured = (
+        np.asarray(s.collection.buffer.action)[:, np.arange(9, 25) % 17]
+        for s in (whole[0], state)
+    )
+    # The first actions are uniform all the same.
+    equal(white[:, : RANDOM - 9], coloured[:, : RANDOM - 9])
+    assert (white[:, RANDOM - 9 :] != coloured[:, RANDOM - 9 :]).mean() > 0.9
+
+
+def test_exploring_actions_have_the_noise_of_the_setting(program, started, pink):
+    # A policy of standard normals that learns nothing, in episodes of 20 steps.
+    *hidden, last = started.learner.params
+    params = (*hidden, jax.tree.map(jnp.zeros_like, last))
+    learner = started.learner._replace(params=params)
+    alive = jnp.zeros_like(started.alive)
+    state = started._replace(learner=learner, alive=alive)
+    seen = []
+    for time in range(0, 220, 20):
+        state, _ = go(program, pink, state, [20], time=time)
+        held = np.arange(time + 4, time + 20) % (SHAPE.transitions + 1)
+        seen.append(np.arctanh(np.asarray(state.collection.buffer.action)[:, held]))
+    # `[episodes, members, steps, sequences]`, after the episode with uniform actions.
+    noise = np.reshape(seen[1:], (10, 4, 16, -1))
+    # Configurations share the draws of a seed.
+    np.testing.assert_allclose(noise[:, :2], noise[:, 2:], atol=1e-4)
+    noise = np.moveaxis(noise[:, :2], 2, 0).reshape(16, 10, -1)
+    # Autocovariance is the transform of the power, which is flat below 1/20.
+    turns = 2 * np.pi * np.arange(20) / 20
+    power = 1 / np.array([1, *range(1, 11), *range(9, 0, -1)])
+    for lag in (0, 1, 5):
+        products = noise[: 16 - lag] * noise[lag:]
+        expected = np.sum(power * np.cos(lag * turns)) / power.sum()
+        assert products.mean() == pytest.approx(expected, abs=0.1)
+    # Every episode has noise of its own.
+    assert np.mean(noise[:, 1:] * noise[:, :-1]) == pytest.approx(0, abs=0.1)
 
 
 def test_the_buffer_holds_what_the_environments_did(program, whole):

@@ -19,7 +19,7 @@ def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Se
         updates=4,
         warmup=160,
         eval_episodes=4,
-        selection_episodes=12,
+        selection_episodes=2,
         report_every=160,
         checkpoint_every=320,
         sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),

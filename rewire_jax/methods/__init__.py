@@ -1,6 +1,6 @@
 """The methods by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from rewire_jax.errors import UserError
@@ -18,14 +18,17 @@ class Entry(NamedTuple):
         settings ready to use or raises `UserError`.
       preset: `(scenario name, period, profile) -> settings`; tasks recur after
         `period` places.
-      selection_episodes: what its candidates are played by default, in all; None for
+      selection_episodes: that each of its candidates is played by default; None for
         the profile's number.
+      together: makes the settings of members of one population alike in all that
+        shapes the program.
     """
 
     make: Callable[[Spec, Any], Method]
     settings: type
     preset: Callable[[str, int, str], Any]
     selection_episodes: int | None = None
+    together: Callable[[Sequence[Any]], list[Any]] = list
 
 
 # In the order of the paper's Table 1.
@@ -37,8 +40,13 @@ METHODS: dict[str, Entry] = {
     "pnn": Entry(progressive.pnn, progressive.PnnSettings, progressive.preset),
     "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
     "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
-    "csp": Entry(subspace.csp, subspace.CspSettings, subspace.preset, 8),
-    "rewire": Entry(rewiring.rewire, rewiring.RewireSettings, rewiring.preset),
+    "csp": Entry(subspace.csp, subspace.CspSettings, subspace.preset, 1),
+    "rewire": Entry(
+        rewiring.rewire,
+        rewiring.RewireSettings,
+        rewiring.preset,
+        together=rewiring.together,
+    ),
 }
 
 

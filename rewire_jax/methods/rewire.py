@@ -1,6 +1,7 @@
 """Rewire: multi-mode wirings, their cache, distillation and alignment."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -87,6 +88,12 @@ class RewireSettings:
             flag = name.replace("_", "-")
             require(0 < value < jnp.inf, f"--{flag} must be above 0, not {value}")
         return dataclasses.replace(self, mode_slots=self.mode_slots or self.modes)
+
+
+def together(members: Sequence[RewireSettings]) -> list[RewireSettings]:
+    """Settings with places for the modes of all of them."""
+    places = max(max(options.modes, options.mode_slots) for options in members)
+    return [dataclasses.replace(options, mode_slots=places) for options in members]
 
 
 # Scenario: tau, noise, alpha, beta, head slots. Published with the authors' code.
