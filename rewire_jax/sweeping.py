@@ -1,0 +1,321 @@
+"""A sweep: configurations times seeds as one population, task after task.
+
+settings.json        what all members share, the axes, the members, provenance
+task-000/            the first task
+  batches.json       which members are trained on it side by side
+  batch-000/         their tables and checkpoints, as a run's (see `runfolder`)
+
+Each task is trained by all members, in batches that fit the memory, before the next
+one begins; so the worst can be left out of the next (successive halving, Jamieson and
+Talwalkar 2016).
+"""
+
+import contextlib
+import functools
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax import checkpoint, config, memory, population, runfolder, standing
+from rewire_jax.axes import configure, draws, grid, read
+from rewire_jax.config import Settings, require
+from rewire_jax.continual import Run, Stopped, interruptible
+from rewire_jax.errors import UserError
+from rewire_jax.methods import find_method
+from rewire_jax.plan import Plan, prepare
+from rewire_jax.population import Member
+from rewire_jax.progress import Progress
+from rewire_jax.ranking import rank
+from rewire_jax.scenarios import Scenario, make_scenario
+from rewire_jax.standing import Standing
+from rewire_jax.sweepdata import read_sweep
+
+_BATCHES = "batches.json"
+_POLL = 1.0  # seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """A sweep, prepared.
+
+    Attributes:
+      folder: of the sweep.
+      settings: what all members share; at the axes, the first configuration's.
+      scenario: of all members.
+      crowd: all members, the seeds of a configuration side by side.
+      halving: of the configurations, one in this many goes on to the next task.
+      most: members trained side by side at most.
+      progress: makes the display.
+    """
+
+    folder: Path
+    settings: Settings
+    scenario: Scenario
+    crowd: tuple[Member, ...]
+    halving: int
+    most: int
+    progress: Callable[..., Progress]
+
+    def run(self) -> None:
+        """Trains what is not finished; each process its own batches.
+
+        Raises:
+          Stopped: interrupted; what is finished is saved.
+        """
+        for stage in range(self.settings.tasks):
+            batches, places = self.batches(stage)
+            own = range(jax.process_index(), len(batches), jax.process_count())
+            for number in own:
+                self.train(stage, number, batches, places)
+            # Also at the end: the process that coordinates must outlive the others.
+            _wait(functools.partial(self.finished, stage, len(batches)))
+
+    def batches(self, stage: int) -> tuple[list[list[int]], int]:
+        """Numbers of the members trained on a task, batch by batch, and the places."""
+        path = self.folder / f"task-{stage:03d}" / _BATCHES
+        if jax.process_index() == 0 and not path.exists():
+            numbers = self.survivors(stage)
+            size, count = self.share(len(numbers))
+            batches = [numbers[i * size : (i + 1) * size] for i in range(count)]
+            path.parent.mkdir(exist_ok=True)
+            runfolder.write(path, {"size": size, "batches": batches})
+        _wait(path.exists)
+        read = json.loads(path.read_text())
+        return read["batches"], read["size"]
+
+    def survivors(self, stage: int) -> list[int]:
+        """The members that are to be trained on a task."""
+        if stage == 0:
+            return [member.number for member in self.crowd]
+        before = [n for batch in self.batches(stage - 1)[0] for n in batch]
+        if self.halving == 1:
+            return before
+        data = read_sweep(self.folder)
+        scores = data.choice[before, stage - 1, :stage].mean(axis=1)
+        scores = np.where(data.diverged[before, stage - 1], np.nan, scores)
+        seeds = self.settings.seeds
+        order = rank(scores.reshape(-1, seeds))
+        kept = order[: math.ceil(len(order) / self.halving)]
+        return [n for i in sorted(kept) for n in before[i * seeds : (i + 1) * seeds]]
+
+    def share(self, members: int) -> tuple[int, int]:
+        """Places in a batch and how many batches, for so many members."""
+        count = math.ceil(members / self.most)
+        if members >= jax.process_count():
+            count = jax.process_count() * math.ceil(count / jax.process_count())
+        size = math.ceil(members / count)
+        devices = jax.local_device_count()
+        if size > devices:
+            size = devices * math.ceil(size / devices)
+        return size, math.ceil(members / size)
+
+    def finished(self, stage: int, batches: int) -> bool:
+        """Whether all of a task's batches are."""
+        folders = (self.batch(stage, number) for number in range(batches))
+        return all(standing.finished(folder, stage) for folder in folders)
+
+    def batch(self, stage: int, number: int) -> Path:
+        """A batch's folder."""
+        return self.folder / f"task-{stage:03d}" / f"batch-{number:03d}"
+
+    def plan(self, numbers: Sequence[int], places: int) -> Plan:
+        """The plan of a batch."""
+        crowd = [self.crowd[number] for number in numbers]
+        return prepare(self.settings, self.scenario, crowd, places)
+
+    def train(
+        self, stage: int, number: int, batches: list[list[int]], places: int
+    ) -> None:
+        """Trains a batch on a task, or what is left of that."""
+        folder = self.batch(stage, number)
+        if standing.finished(folder, stage):
+            return
+        plan = self.plan(batches[number], places)
+        folder.mkdir(exist_ok=True)
+        label = f"{self.settings.method} sweep on {self.settings.scenario}"
+        if len(batches) > 1:
+            label += f", batch {number + 1} of {len(batches)}"
+        names = [member.name for member in plan.crowd]
+        with self.progress(plan.names, plan.interactions, names, label) as display:
+            run = Run(plan, folder, display, choosing=True)
+            with interruptible(run), self.interrupted():
+                now = standing.restore(folder, plan, display.message)
+                if now is None:
+                    now = self.gather(stage, plan) if stage else run.start()
+                run.task(now, self.ahead(stage, number, len(batches)))
+
+    def ahead(self, stage: int, number: int, batches: int) -> int:
+        """Batches that this process is still to train after one."""
+        processes = jax.process_count()
+        left = (batches - number - 1) // processes
+        for later in range(1, self.settings.tasks - stage):
+            left += math.ceil(batches / self.halving**later / processes)
+        return left
+
+    def gather(self, stage: int, plan: Plan) -> Standing:
+        """A batch's members as they were after the task before, wherever that was."""
+        found: dict[int, Any] = {}
+        wanted = {member.number for member in plan.crowd}
+        batches, places = self.batches(stage - 1)
+        for number, batch in enumerate(batches):
+            if wanted.isdisjoint(batch):
+                continue
+            folder = self.batch(stage - 1, number)
+            try:
+                items = standing.read_kept(folder, stage - 1, self.plan(batch, places))
+            except checkpoint.CheckpointError as error:
+                raise UserError(
+                    f"{error}; or delete {folder} and resume to train it anew"
+                ) from error
+            for place, name in enumerate(batch):
+                found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
+        rows = [found[member.number] for member in plan.crowd]
+        rows += rows[:1] * (plan.places - len(rows))
+        items = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
+        return standing.between(stage, items, plan)
+
+    @contextlib.contextmanager
+    def interrupted(self) -> Iterator[None]:
+        """Says how to go on with the whole sweep."""
+        try:
+            yield
+        except Stopped:
+            raise Stopped(
+                f"stopped and saved: continue with --resume --out {self.folder}"
+            ) from None
+
+
+def sweep(
+    settings: Settings,
+    out: str | Path,
+    *,
+    axes: Mapping[str, Sequence[float]] | None = None,
+    configurations: Sequence[Mapping[str, float]] = (),
+    random: int = 0,
+    halving: int = 1,
+    members_per_batch: int = 0,
+    scenario: Scenario | None = None,
+    resume: bool = False,
+    progress: Callable[..., Progress] = Progress,
+) -> Path:
+    """Trains every configuration with every seed as one population.
+
+    Where several processes have joined by `jax.distributed`, all of them must call
+    this alike, on one file system: each trains batches of its own.
+
+    Args:
+      settings: what the members share; `seeds` is of each configuration.
+      out: folder of the sweep, new or empty, or with `resume` an unfinished one.
+      axes: names of traced settings and their values, of which every combination is
+        a configuration; `modes` is K.
+      configurations: these instead, each with values for the same settings.
+      random: so many random configurations instead; the axes' values are ranges.
+      halving: after each task the best 1 / `halving` of the configurations go on, by
+        episodes apart from those that are reported; 1 for all.
+      members_per_batch: trained side by side at most; 0 for as many as fit.
+      scenario: one of your own; otherwise made from the settings.
+      resume: go on with what is not finished.
+      progress: makes the display.
+
+    Returns:
+      The folder; see `sweeping` for what it holds, and `write_sweep_report`.
+
+    Raises:
+      UserError: settings that make no sense, a folder that does not fit, a full disk.
+      Stopped: interrupted, and saved.
+    """
+    folder = Path(out)
+    require(halving >= 1, f"--halving must be at least 1, not {halving}")
+    require(members_per_batch >= 0, "--members-per-batch must be at least 0")
+    require(random >= 0, f"--random must be at least 0, not {random}")
+    config.validate(settings)
+    if not configurations:
+        require(bool(axes), "a sweep needs an axis, such as --alpha 0 1e-5")
+        assert axes is not None
+        configurations = draws(axes, random, settings) if random else grid(axes)
+    settings, crowd = _crowd(settings, configurations)
+    scenario = scenario or make_scenario(settings.scenario, settings.backend)
+    plan = prepare(settings, scenario, crowd[:1])
+    members = [
+        {
+            "member": member.number,
+            "configuration": member.number // settings.seeds,
+            "seed": member.seed,
+            "values": {name: read(member, name) for name in configurations[0]},
+        }
+        for member in crowd
+    ]
+    header = {
+        "kind": "sweep",
+        "settings": config.to_json(plan.settings),
+        "axes": axes or _values(members),
+        "random": random,
+        "halving": halving,
+        "members": members,
+        "tasks": plan.names,
+        "spec": plan.spec._asdict(),
+        "episode_length": scenario.environment.episode_length,
+        "provenance": runfolder.provenance(),
+    }
+    if jax.process_index() == 0 and not resume:
+        runfolder.create(folder, header)
+    _wait((folder / runfolder.HEADER).exists)
+    runfolder.compare(folder, plan.settings, "sweep")
+    saved = runfolder.read_header(folder, "sweep")
+    require(
+        saved["members"] == members and saved["halving"] == halving,
+        f"{folder} was started with other axes, seeds or halving: give the same again "
+        "or name another --out",
+    )
+    Sweep(
+        folder=folder,
+        settings=plan.settings,
+        scenario=scenario,
+        crowd=crowd,
+        halving=halving,
+        most=members_per_batch or memory.fitting(plan, jax.local_devices()),
+        progress=progress,
+    ).run()
+    return folder
+
+
+def _crowd(
+    settings: Settings, configurations: Sequence[Mapping[str, float]]
+) -> tuple[Settings, tuple[Member, ...]]:
+    """The settings that a population shares, and its members."""
+    same = {tuple(values) for values in configurations}
+    require(len(same) == 1, "all configurations need values for the same settings")
+    variants = [configure(settings, values) for values in configurations]
+    together = find_method(settings.method).together([v.options for v in variants])
+    pairs = [(v.sac, options) for v, options in zip(variants, together, strict=True)]
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    crowd = tuple(
+        member._replace(name=f"member {member.number}")
+        for member in population.cross(pairs, seeds)
+    )
+    return replace(variants[0], options=together[0]), crowd
+
+
+def _values(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """The values that each setting has among the members, in their order."""
+    values: dict[str, list[float]] = {}
+    for member in members:
+        for name, value in member["values"].items():
+            values.setdefault(name, [])
+            if value not in values[name]:
+                values[name].append(value)
+    return values
+
+
+def _wait(done: Callable[[], bool]) -> None:
+    """Waits for what another process does; its end, too, would end this one."""
+    while not done():
+        time.sleep(_POLL)
