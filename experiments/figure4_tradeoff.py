@@ -42,7 +42,7 @@ def run(job: Figure4) -> None:
       UserError: wrong arguments.
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
-    out = job.out / job.name("figure4")
+    out = job.folder("figure4")
     runs = [r for name in job.scenarios for r in job.runs(name, variants(job, name))]
     reports = suite.reports(suite.train(runs, job), out)
     found = suite.averages(reports)

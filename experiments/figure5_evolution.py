@@ -3,9 +3,9 @@
 Figure 3 is made from two of the same runs.
 """
 
-from dataclasses import dataclass
-
-from experiments import suite
+from experiments import first_task, suite
+from experiments.first_task import FirstTask
+from rewire_jax.evolution import evolution
 
 # Names are those of the other experiments' runs. On the first task there is nothing to
 # align with: what Table 3 calls aligned is rewiring alone.
@@ -15,29 +15,40 @@ VARIANTS: suite.Variants = {
     "ft1": ("ft1", {}),
     "rewire-aligned": ("rewire", {"modes": 1}),
 }
+LABELS = {
+    "ft1": "FT-1",
+    "rewire-aligned": "Rewire (K = 1)",
+    "rewire": "Ours",
+    "rewire-undistilled": "Ours without L_KL",
+}
+PANELS = (("ft1", "rewire-aligned", "rewire"), ("rewire-undistilled", "rewire"))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Figure5(suite.Experiment):
-    """What to run.
-
-    Attributes:
-      scenario: name of the scenario.
-    """
-
-    scenario: str = "halfcheetah/forgetting"
-    tasks: int = 1
-
-
-def run(job: Figure5) -> None:
-    """Trains what is not finished.
+def run(job: FirstTask) -> None:
+    """Trains what is not finished, and draws the figure.
 
     Raises:
       UserError: wrong arguments.
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
-    suite.train(job.runs(job.scenario, VARIANTS), job)
+    runs = suite.train(job.runs(job.scenario, VARIANTS), job)
+    title, found, origins = first_task.read("Figure 5", runs, LABELS)
+    curves = {name: found[name] for name in LABELS if name in found}
+    path = job.folder("figure5") / "figure5"
+    picture = path.with_suffix(".png")
+    notes = (
+        f"![Figure 5]({picture.name})",
+        "",
+        first_task.READING,
+        "",
+        *origins,
+    )
+    table = first_task.summary(list(curves.values()), "training return")
+    suite.write(path, title, table, notes, first_task.rows(curves))
+    panels = [[curves[name] for name in panel if name in curves] for panel in PANELS]
+    evolution(panels, "training return", title, picture)
+    print(picture)
 
 
 if __name__ == "__main__":
-    suite.command(Figure5, run, "figure5_evolution")
+    suite.command(FirstTask, run, "figure5_evolution")

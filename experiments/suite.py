@@ -4,11 +4,9 @@ A run that is finished is not run again, and one that was stopped goes on, so th
 command can be given until all is done. Experiments find each other's runs.
 """
 
-import csv
-import json
 import statistics
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -21,9 +19,10 @@ from rewire_jax.errors import UserError
 from rewire_jax.plan import prepare
 from rewire_jax.published import Figures
 from rewire_jax.report import Report
-from rewire_jax.rundata import read_run
+from rewire_jax.rundata import RunData, read_run
 from rewire_jax.runfolder import HEADER, TABLES, compare, provenance
 from rewire_jax.summary import Summary
+from rewire_jax.tables import csv_text, json_text
 
 T = TypeVar("T")
 Variants = dict[str, tuple[str, dict[str, Any]]]
@@ -95,9 +94,15 @@ class Experiment(Job):
 
     Attributes:
       out: folder of all runs, with a folder for each scenario, and of the results.
+      keep: put the result under experiments/results instead, to be committed.
     """
 
     out: Path = Path("runs")
+    keep: bool = False
+
+    def folder(self, what: str) -> Path:
+        """The folder of a result."""
+        return (RESULTS if self.keep else self.out) / self.name(what)
 
     def runs(self, scenario: str, variants: Variants) -> list["Run"]:
         """The runs on one scenario."""
@@ -243,15 +248,20 @@ def origins(made: Sequence[Report]) -> list[str]:
     lines = []
     for report in made:
         lines += [f"- {report.title}", *(f"  - **{note}**" for note in report.notes)]
-        for summary in report.summaries:
-            run, how = summary.run, summary.run.provenance
-            seeds = ", ".join(str(seed) for seed in run.seeds)
-            lines.append(
-                f"  - {summary.label}: `{run.folder}`, seeds {seeds}, "
-                f"{run.finished} of {len(run.tasks)} tasks, commit "
-                f"`{how.get('commit')}`, started `{how.get('started')}`"
-            )
+        lines += [f"  - {origin(each.label, each.run)}" for each in report.summaries]
     return lines
+
+
+def origin(label: str, run: RunData) -> str:
+    """Markdown: where a run's numbers come from."""
+    seeds, how = ", ".join(str(seed) for seed in run.seeds), run.provenance
+    if run.diverged:
+        seeds += f" (diverged: {', '.join(str(seed) for seed in run.diverged)})"
+    return (
+        f"{label}: `{run.folder}`, seeds {seeds}, {run.finished} of "
+        f"{len(run.tasks)} tasks, commit `{how.get('commit')}`, "
+        f"started `{how.get('started')}`"
+    )
 
 
 def write(
@@ -259,7 +269,7 @@ def write(
     title: str,
     table: Sequence[Sequence[str]],
     notes: Sequence[str],
-    rows: Sequence[Mapping[str, Any]],
+    rows: Sequence[dict[str, Any]],
 ) -> None:
     """Writes a result as Markdown, CSV and JSON, and prints it.
 
@@ -276,11 +286,8 @@ def write(
     result = {"title": title, "rows": rows, "provenance": provenance()}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".md").write_text(shown, encoding="utf-8")
-    path.with_suffix(".json").write_text(json.dumps(result, indent=1) + "\n")
-    with path.with_suffix(".csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    path.with_suffix(".json").write_text(json_text(result))
+    path.with_suffix(".csv").write_text(csv_text(rows))
     print(shown)
     print(*(path.with_suffix(end) for end in (".md", ".csv", ".json")), sep="\n")
 

@@ -39,7 +39,7 @@ def run(job: Table1) -> None:
     domains: dict[str, list[suite.Run]] = {}
     for name in dict.fromkeys(job.scenarios):
         domains.setdefault(name.split("/")[0], []).extend(job.runs(name, variants))
-    out = job.out / job.name("table1")
+    out = job.folder("table1")
     done = suite.train([run for runs in domains.values() for run in runs], job)
     head, reports, rows = ["method"], [], []
     lines = {method: [published.NAMES.get(method, method)] for method in variants}

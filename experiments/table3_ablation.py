@@ -58,7 +58,7 @@ def run(job: Table3) -> None:
       UserError: wrong arguments.
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
-    out = job.out / job.name("table3")
+    out = job.folder("table3")
     runs = suite.train(job.runs(job.scenario, variants(job)), job)
     reports = suite.reports(runs, out)
     found = suite.averages(reports)
