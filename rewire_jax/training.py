@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax import networks, replay, rollout, sac
+from rewire_jax import networks, noise, replay, rollout, sac
 from rewire_jax.config import SacSettings
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods.base import Method
@@ -98,8 +98,12 @@ def collect(
     environment: Environment,
     method: Method,
     shape: Shape,
+    sequence: jax.Array | None,
 ) -> tuple[Collection, rollout.Step]:
-    """One exploring step of all environments of a member, stored in its buffer."""
+    """One exploring step of all environments of a member, stored in its buffer.
+
+    `sequence` is the coloured noise that `time` lies in, None where noise is white.
+    """
     learner, (buffer, episodes, label), _ = state
     context_key, action_key, random_key, label_key = jax.random.split(key, 4)
     label = method.label(label_key, learner.memory, label, episodes.steps)
@@ -107,7 +111,10 @@ def collect(
     mean, log_std = method.distribution(
         learner.params, learner.memory, context, episodes.state.observation
     )
-    action, _ = networks.sample_action(action_key, mean, log_std)
+    if sequence is None:
+        action, _ = networks.sample_action(action_key, mean, log_std)
+    else:
+        action = jnp.tanh(mean + jnp.exp(log_std) * sequence[time % len(sequence)])
     if shape.random:
         uniform = jax.random.uniform(random_key, action.shape, minval=-1.0)
         action = jnp.where(time < shape.random, uniform, action)
@@ -219,12 +226,24 @@ def train(
     update = functools.partial(
         learn, environment=environment, method=method, settings=settings
     )
+    color, length = settings.noise_color, environment.episode_length
+    size = shape.envs, environment.action_size
+
+    def draw_sequence(index):
+        # As long as an episode. A key that the steps do not use.
+        start_key = jax.random.fold_in(key, index - index % length)
+        sequence_key = jax.random.split(start_key, 4)[3]
+        return noise.colored(sequence_key, color, length, size)
 
     def step(index, carry):
-        state, report = carry
+        state, report, sequence = carry
+        if sequence is not None:
+            # It is not part of the state: a chunk draws it anew.
+            due = (index % length == 0) | (index == time)
+            sequence = jax.lax.cond(due, draw_sequence, lambda _: sequence, index)
         collect_key, update_key = jax.random.split(jax.random.fold_in(key, index))
         collection, stepped = collect(
-            collect_key, state, task, index, environment, method, shape
+            collect_key, state, task, index, environment, method, shape, sequence
         )
         state = state._replace(collection=collection)
         updates = jnp.where(index >= shape.warmup, shape.updates, 0)
@@ -239,14 +258,16 @@ def train(
             jax.tree.map(jnp.add, report.metrics, metrics),
             {},
         )
-        return state, report
+        return state, report, sequence
 
     _, shapes = jax.eval_shape(update, key, state, time, time, 1)
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     none = jnp.zeros(())
     report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros, {})
     end = time + steps
-    state, report = jax.lax.fori_loop(time, end, step, (state, report))
+    sequence = jnp.zeros((length, *size)) if color else None
+    carry = state, report, sequence
+    state, report, _ = jax.lax.fori_loop(time, end, step, carry)
     # A key that the next step does not use.
     batch_key = jax.random.split(jax.random.fold_in(key, end), 3)[2]
     batch = draw_batch(batch_key, state, end, environment, settings)

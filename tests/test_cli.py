@@ -61,6 +61,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("probe/reach --tasks 5", "--tasks"),
         ("probe/reach --lr-policy 0", "--lr-policy"),
         ("probe/reach --discount 1.5", "--discount"),
+        ("probe/reach --noise-color -1", "--noise-color"),
+        ("probe/reach --noise-color inf", "--noise-color"),
         ("probe/reach --warmup 20000", "--warmup"),
         ("probe/reach --envs 0", "--envs"),
         ("probe/reach --seeds many", "many"),
