@@ -12,7 +12,7 @@ import numpy as np
 from experiments import first_task, suite
 from experiments.figure5_evolution import VARIANTS
 from experiments.first_task import FirstTask
-from rewire_jax.evolution import Curve, evolution
+from rewire_jax.evolution import Curve
 from rewire_jax.figures import Array, number
 
 LABELS = {"rewire": "with L_KL", "rewire-undistilled": "without L_KL"}
@@ -71,27 +71,16 @@ def run(job: FirstTask) -> None:
     """
     variants = {name: VARIANTS[name] for name in LABELS}
     runs = suite.train(job.runs(job.scenario, variants), job)
-    title, curves, origins = first_task.read(
-        "Figure 3", runs, LABELS, "mode_divergence"
-    )
-    path = job.folder("figure3") / "figure3"
-    picture = path.with_suffix(".png")
+    found = first_task.read("Figure 3", runs, LABELS, "mode_divergence")
     notes = (
-        f"![Figure 3]({picture.name})",
-        "",
         "Diverge-and-converge is said to appear where the divergence ends below half "
         "of its peak, both taken over a tenth of the progress reports.",
         "",
-        *map(tell, curves.values()),
+        *map(tell, found.curves.values()),
         "",
-        first_task.READING,
-        "",
-        *origins,
     )
-    table = first_task.summary(list(curves.values()), QUANTITY)
-    suite.write(path, title, table, notes, first_task.rows(curves))
-    evolution([list(curves.values())], QUANTITY, title, picture, log=True)
-    print(picture)
+    path = job.folder("figure3") / "figure3"
+    first_task.write(path, QUANTITY, found, [list(LABELS)], notes, log=True)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ Figure 3 is made from two of the same runs.
 
 from experiments import first_task, suite
 from experiments.first_task import FirstTask
-from rewire_jax.evolution import evolution
 
 # Names are those of the other experiments' runs. On the first task there is nothing to
 # align with: what Table 3 calls aligned is rewiring alone.
@@ -32,22 +31,9 @@ def run(job: FirstTask) -> None:
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
     runs = suite.train(job.runs(job.scenario, VARIANTS), job)
-    title, found, origins = first_task.read("Figure 5", runs, LABELS)
-    curves = {name: found[name] for name in LABELS if name in found}
+    found = first_task.read("Figure 5", runs, LABELS)
     path = job.folder("figure5") / "figure5"
-    picture = path.with_suffix(".png")
-    notes = (
-        f"![Figure 5]({picture.name})",
-        "",
-        first_task.READING,
-        "",
-        *origins,
-    )
-    table = first_task.summary(list(curves.values()), "training return")
-    suite.write(path, title, table, notes, first_task.rows(curves))
-    panels = [[curves[name] for name in panel if name in curves] for panel in PANELS]
-    evolution(panels, "training return", title, picture)
-    print(picture)
+    first_task.write(path, "training return", found, PANELS)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments import suite
 from rewire_jax.config import require
-from rewire_jax.evolution import Curve
+from rewire_jax.evolution import Curve, evolution
 from rewire_jax.figures import number
 from rewire_jax.report import heading
 from rewire_jax.rundata import read_progress, read_run
@@ -37,7 +38,7 @@ class Evolution(NamedTuple):
 
     Attributes:
       title: what was run, and with what budget.
-      curves: by the name of the run.
+      curves: by the name of the run, in the order of the labels.
       origins: Markdown, where the runs come from.
     """
 
@@ -74,7 +75,37 @@ def read(
     seeds = f"{len(data.seeds)} seed{'' if len(data.seeds) == 1 else 's'}"
     subject = f"{subject} on the first task of {data.settings['scenario']}"
     title = heading(subject, data.settings, len(data.tasks), seeds)
+    curves = {name: curves[name] for name in labels if name in curves}
     return Evolution(title, curves, origins)
+
+
+def write(
+    path: Path,
+    quantity: str,
+    found: Evolution,
+    panels: Sequence[Sequence[str]],
+    notes: Sequence[str] = (),
+    *,
+    log: bool = False,
+) -> None:
+    """Writes a table of curves, their numbers and their picture.
+
+    Args:
+      path: of the files, without a suffix.
+      quantity: what the values are.
+      found: what is shown.
+      panels: of the picture, names of the runs in each.
+      notes: lines of Markdown above how to read the table.
+      log: whether the picture's values are.
+    """
+    title, curves, origins = found
+    picture = path.with_suffix(".png")
+    shown = (f"![{title}]({picture.name})", "", *notes, READING, "", *origins)
+    table = summary(list(curves.values()), quantity)
+    suite.write(path, title, table, shown, rows(curves))
+    drawn = [[curves[name] for name in panel if name in curves] for panel in panels]
+    evolution(drawn, quantity, title, picture, log=log)
+    print(picture)
 
 
 def tenth(curve: Curve) -> int:

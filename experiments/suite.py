@@ -6,9 +6,10 @@ command can be given until all is done. Experiments find each other's runs.
 
 import statistics
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 import tyro
@@ -26,7 +27,7 @@ from rewire_jax.tables import csv_text, json_text
 
 T = TypeVar("T")
 Variants = dict[str, tuple[str, dict[str, Any]]]
-"""Methods and some of their options, by the name of the run."""
+"""Methods and some of their options, SAC's among them, by the name of the run."""
 
 RESULTS = Path("experiments/results")
 READING = (
@@ -73,9 +74,14 @@ class Job:
         return name + (f"-tasks-{self.tasks}" if self.tasks else "")
 
     def run(
-        self, scenario: rewire_jax.Scenario, method: str, folder: Path, **options: Any
+        self,
+        scenario: rewire_jax.Scenario,
+        method: str,
+        folder: Path,
+        sac: Mapping[str, Any] = MappingProxyType({}),
+        **options: Any,
     ) -> "Run":
-        """A run of the profile, with these of the method's options."""
+        """A run of the profile, with these of SAC's and of the method's options."""
         settings = rewire_jax.preset(scenario, method, self.profile)
         settings = replace(
             settings,
@@ -83,6 +89,7 @@ class Job:
             seed=self.seed,
             interactions=self.interactions or settings.interactions,
             tasks=self.tasks or settings.tasks,
+            sac=replace(settings.sac, **sac),
             options=replace(settings.options, **options),
         )
         return Run(folder, scenario, settings)

@@ -13,11 +13,13 @@ from experiments import (
     bench_brax,
     figure4_tradeoff,
     model_sizes,
+    pink_noise,
     suite,
     table1_brax,
     table3_ablation,
 )
 from experiments.figure4_tradeoff import Figure4
+from experiments.first_task import FirstTask
 from experiments.table1_brax import Table1
 from experiments.table3_ablation import Table3
 from rewire_jax import config
@@ -164,6 +166,26 @@ def test_figure4_has_narrower_and_wider_policies(trained, tmp_path):
     paper = figure4_tradeoff.variants(Figure4(profile="paper"), NAMES[0])
     assert paper["csp-s"] == ("csp", {"width": 175})
     assert paper["ours-l"] == ("rewire", {"width": 384})
+
+
+def test_pink_noise_differs_in_the_noise_alone(trained, tmp_path):
+    pink_noise.run(FirstTask(seeds=2, out=tmp_path))
+    runs = {folder.name: settings for folder, settings, _ in trained}
+    colors = {name: settings.sac.noise_color for name, settings in runs.items()}
+    assert colors == {"ft1": 0, "ft1-pink": 1, "rewire": 0}
+    sac = dataclasses.replace(runs["ft1"].sac, noise_color=1)
+    assert dataclasses.replace(runs["ft1"], sac=sac) == runs["ft1-pink"]
+    assert {settings.tasks for settings in runs.values()} == {1}
+    out = tmp_path / "pink-noise-quick-tasks-1"
+    # After the first task: FT-1 has half of 1000 and GAP more, the other all of it.
+    shown = (out / "pink-noise.md").read_text()
+    assert "- FT-1: **600 ± 141**\n- FT-1, pink noise: **600 ± 141**" in shown
+    assert "- Ours: **1,100 ± 141**" in shown
+    found = rows(out / "pink-noise.csv")
+    assert [row["run"] for row in found] == [name for name in runs for _ in range(3)]
+    # Training returns of seeds 0 and 1, without a value at first.
+    assert [row["median"] for row in found[:3]] == ["", "650.0", "1150.0"]
+    assert (out / "pink-noise.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize(
