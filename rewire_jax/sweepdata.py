@@ -130,7 +130,8 @@ def read_sweep(folder: str | Path) -> SweepData:
             seen[at], diverged[at] = True, row["diverged"]
             scores[at], choice[at] = row["return"], row["choice"]
             facts[:, member, stage] = row["model_size"], *row["interactions"]
-    if not seen.any():
+    evaluated: Flags = np.all(seen, axis=2)
+    if not evaluated.any():
         raise UserError(f"{folder} holds no results after training yet")
     return SweepData(
         folder=folder,
@@ -144,7 +145,7 @@ def read_sweep(folder: str | Path) -> SweepData:
         configurations=configurations,
         seeds=seeds,
         trained=trained,
-        evaluated=seen.all(axis=2),
+        evaluated=evaluated,
         diverged=np.logical_or.accumulate(diverged.any(axis=2), axis=1),
         scores=scores,
         choice=choice,
