@@ -1,0 +1,78 @@
+"""The paper's Figure 6: performance over K, α and β, a panel for each.
+
+The paper varies each of the three with the others at their best, which takes a grid
+(`--full`). The lines through the profile's own values alone are a sixth of it. Either
+is one sweep, and one population as far as memory goes.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import rewire_jax
+from experiments import suite
+from rewire_jax.axes import grid
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure6(suite.Experiment):
+    """What to run.
+
+    Attributes:
+      scenario: name of the scenario.
+      modes: values of K.
+      alpha: weights of the distillation between modes.
+      beta: weights of the alignment loss.
+      full: every combination; otherwise each with the others at the profile's values.
+      members_per_batch: trained side by side at most; 0 for as many as fit.
+    """
+
+    scenario: str = "halfcheetah/forgetting"
+    modes: tuple[int, ...] = (1, 2, 3, 4)
+    alpha: tuple[float, ...] = (0.0, 1e-6, 1e-5, 1e-4)
+    beta: tuple[float, ...] = (0.1, 1.0, 10.0, 100.0)
+    full: bool = False
+    members_per_batch: int = 0
+
+
+def configurations(job: Figure6, options: Any) -> list[dict[str, float]]:
+    """What is trained: the grid, or the lines through these options."""
+    axes = {"modes": job.modes, "alpha": job.alpha, "beta": job.beta}
+    if job.full:
+        return grid(axes)
+    centre = {name: getattr(options, name) for name in axes}
+    return [centre] + [
+        centre | {name: value}
+        for name, values in axes.items()
+        for value in values
+        if value != centre[name]
+    ]
+
+
+def run(job: Figure6) -> None:
+    """Trains what is not finished, and writes the figure and its numbers.
+
+    Raises:
+      UserError: wrong arguments.
+      rewire_jax.Stopped: interrupted; the same command goes on.
+    """
+    scenario = rewire_jax.make_scenario(job.scenario, job.backend)
+    what = "figure6-grid" if job.full else "figure6-lines"
+    folder = job.out / job.name(job.scenario) / what
+    made = job.run(scenario, "rewire", folder)
+    if job.train:
+        rewire_jax.sweep(
+            made.settings,
+            folder,
+            configurations=configurations(job, made.settings.options),
+            members_per_batch=job.members_per_batch,
+            scenario=scenario,
+            resume=made.started,
+        )
+    out = job.folder(f"{what}-{job.scenario}")
+    report = rewire_jax.write_sweep_report(folder, out)
+    print(report.markdown.read_text(encoding="utf-8"))
+    print(*report.paths, sep="\n")
+
+
+if __name__ == "__main__":
+    suite.command(Figure6, run, "figure6_sensitivity")
