@@ -33,9 +33,14 @@ class Pattern(NamedTuple):
     end: float
 
     @property
+    def share(self) -> float:
+        """What is left of the peak at the end."""
+        return self.end / self.peak if self.peak > 0 else 1.0
+
+    @property
     def converges(self) -> bool:
-        """Whether it comes down to less than half of its peak."""
-        return self.end < self.peak / 2
+        """Whether that is less than half."""
+        return self.share < 0.5
 
 
 def pattern(x: Array, values: Array, window: int) -> Pattern:
@@ -58,7 +63,7 @@ def tell(curve: Curve) -> str:
         f"**{'appears' if mean.converges else 'does not appear'}** in the mean, and "
         f"appears in {sum(seeds)} of {len(seeds)} seeds. The mean is highest around "
         f"{mean.at:,.0f} interactions, {number(mean.peak)}, and {number(mean.end)} at "
-        f"the end, {mean.end / mean.peak:.0%} of that."
+        f"the end, {mean.share:.0%} of that."
     )
 
 

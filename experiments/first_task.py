@@ -68,10 +68,10 @@ def read(
     for run in runs:
         name, data = run.folder.name, read_run(run.folder)
         x, values = (read_progress(data, value) if value else data.curve)[0]
-        if x.size:
+        if x.size and data.kept.any():
             curves[name] = Curve(labels[name], x, values[data.kept])
             origins.append(f"- {suite.origin(labels[name], data)}")
-    require(bool(curves), "none of the runs has trained long enough to be shown")
+    require(bool(curves), "none of the runs has reported on a seed without divergence")
     seeds = f"{len(data.seeds)} seed{'' if len(data.seeds) == 1 else 's'}"
     subject = f"{subject} on the first task of {data.settings['scenario']}"
     title = heading(subject, data.settings, len(data.tasks), seeds)

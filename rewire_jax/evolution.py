@@ -42,14 +42,18 @@ class Curve(NamedTuple):
     def interval(self) -> Array:
         """Ends of the mean's 95% bootstrap interval, `[2, points]`.
 
-        NaN with fewer than two seeds, which say nothing of the spread.
+        NaN where a value is missing, or with fewer than two seeds, which say nothing
+        of the spread.
         """
-        ends = [
-            stratified_bootstrap(point[:, None], lambda values: values.mean(axis=-1))
-            for point in self.values.T
-        ]
-        nothing = (np.nan, np.nan)
-        return np.array([each or nothing for each in ends]).reshape(-1, 2).T
+        ends = np.full((2, self.x.size), np.nan)
+        for i, point in enumerate(self.values.T):
+            if len(point) > 1 and not np.isnan(point).any():
+                ends[:, i] = stratified_bootstrap(point[:, None], _mean)
+        return ends
+
+
+def _mean(values: Array) -> Array:
+    return np.mean(values, axis=-1)
 
 
 def evolution(

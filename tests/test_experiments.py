@@ -12,6 +12,7 @@ import rewire_jax
 from experiments import (
     bench_brax,
     figure4_tradeoff,
+    figure5_evolution,
     model_sizes,
     pink_noise,
     suite,
@@ -188,6 +189,26 @@ def test_pink_noise_differs_in_the_noise_alone(trained, tmp_path):
     assert (out / "pink-noise.png").stat().st_size > 0
 
 
+def test_figure5_turns_modes_and_distillation_off(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "RESULTS", tmp_path / "kept")
+    job = FirstTask(out=tmp_path, seeds=2, keep=True)
+    figure5_evolution.run(job)
+    chosen = {f.name: s for f, s, _ in trained}
+    assert {s.tasks for s in chosen.values()} == {1}
+    ours, alone = chosen["rewire"].options, chosen["rewire-aligned"].options
+    undistilled = chosen["rewire-undistilled"].options
+    assert (ours.modes, undistilled.modes, alone.modes) == (3, 3, 1)
+    assert (ours.alpha, undistilled.alpha) == (1e-5, 0)
+    assert dataclasses.replace(undistilled, alpha=1e-5) == ours
+    assert chosen["ft1"].method == "ft1"
+    # Seed 1 earns 300 more, and the first report of all has no reward.
+    path = tmp_path / "kept/figure5-quick-tasks-1/figure5.csv"
+    found = [row for row in rows(path) if row["run"] == "ft1"]
+    assert [row["mean"] for row in found] == ["", "650.0", "1150.0"]
+    assert path.with_suffix(".png").stat().st_size > 0
+    assert "1,150" in path.with_suffix(".md").read_text()
+
+
 @pytest.mark.parametrize(
     ("module", "kind", "arguments"),
     [
@@ -197,6 +218,7 @@ def test_pink_noise_differs_in_the_noise_alone(trained, tmp_path):
         (table1_brax, Table1, "--scenarios probe/reach probe/rech"),
         (table3_ablation, Table3, "--scenario probe/reach --profile slow"),
         (figure4_tradeoff, Figure4, "--scenarios probe/reach --interactions 3"),
+        (figure5_evolution, FirstTask, "--scenario probe/reach --tasks 9"),
     ],
 )
 def test_what_is_wrong_ends_in_a_line_before_anything_runs(

@@ -739,6 +739,70 @@ def test_spare_places_change_nothing():
     assert np.any(memory.orders[0, 1] != memory.orders[1, 1])
 
 
+# What is told about modes
+
+
+def divergence(hidden, scores, head, observation=OBSERVATION):
+    """Mean KL over pairs of modes, states and actions, one pair after the other."""
+    policies = [play(hidden, orders_of(v), head, observation) for v in scores]
+    pairs = []
+    for i, (mean, log_std) in enumerate(policies):
+        for j, (other, other_log_std) in enumerate(policies):
+            if i == j:
+                continue
+            variance = np.exp(2 * np.float64(log_std))
+            other_variance = np.exp(2 * np.float64(other_log_std))
+            kl = np.log(other_variance / variance) / 2 - 0.5
+            kl += (variance + (mean - other) ** 2) / (2 * other_variance)
+            pairs.append(kl.sum(axis=-1).mean())
+    return np.mean(pairs)
+
+
+@pytest.mark.parametrize("learned", [0, 2])
+def test_mode_divergence_against_a_loop_over_pairs(learned):
+    rng = np.random.default_rng(29)
+    method = make(dropout=0.3)  # must not be seen in it
+    params, memory = method.init(KEY)
+    params = trained(rng, params)
+    memory = memory._replace(learned=jnp.asarray(learned))
+    told = method.inspect(params, memory, OBSERVATION)
+    head = head_at(params, learned)
+    expected = divergence(params.hidden, params.scores, head)
+    assert expected > 0.1
+    np.testing.assert_allclose(told["mode_divergence"], expected, rtol=1e-4)
+    # Not that of the other task's head.
+    other = divergence(params.hidden, params.scores, head_at(params, 1))
+    assert not np.isclose(expected, other, rtol=0.01)
+
+
+def test_modes_that_are_not_in_use_have_no_part_in_the_divergence():
+    params, memory = make().init(KEY)
+    params = trained(np.random.default_rng(31), params)
+    told = {}
+    for modes in (1, 2, 3):
+        method = make(modes=modes, mode_slots=5)
+        spare = np.full((2, *params.scores.shape[1:]), np.nan, np.float32)
+        wide = params._replace(scores=np.concatenate([params.scores, spare]))
+        told[modes] = method.inspect(wide, memory, OBSERVATION)["mode_divergence"]
+        if modes > 1:
+            expected = divergence(
+                params.hidden, params.scores[:modes], head_at(params, 0)
+            )
+            np.testing.assert_allclose(told[modes], expected, rtol=1e-4)
+    assert told[1] == 0
+    assert not np.isclose(told[2], told[3], rtol=0.01)
+
+
+def test_equal_modes_are_not_apart():
+    method = make()
+    params, memory = method.init(KEY)
+    params = trained(np.random.default_rng(37), params)
+    # The same order in other scores: the policy is the same.
+    scores = np.stack([params.scores[0] * factor for factor in (1.0, 2.0, 0.5)])
+    told = method.inspect(params._replace(scores=scores), memory, OBSERVATION)
+    assert told["mode_divergence"] == 0
+
+
 # Variants (Table 3)
 
 
