@@ -175,8 +175,10 @@ def _reading(summary: SweepSummary) -> str:
         text += "; hollow: after fewer tasks"
     if summary.sweep.random or len(summary.panels) < 2:
         return f"{text}."
+    # A panel names the values of all axes but its own.
     centre = {
-        name: value for panel in summary.panels for name, value in panel.others.items()
+        panel.axis: summary.panels[place - 1].others[panel.axis]
+        for place, panel in enumerate(summary.panels)
     }
     best = summary.best is not None and summary.best.values == centre
     where = "at their best" if best else "where the lines of the sweep cross"

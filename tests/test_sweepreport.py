@@ -97,7 +97,7 @@ def test_panels_vary_one_axis_from_the_best(tmp_path):
         expected = sorted({values[axis] for values in GRID})
         assert [each.values for each in line] == [best | {axis: x} for x in expected]
     text = report.markdown.read_text()
-    assert "the other axes at their best: alpha 1e-5, beta 1, modes 3." in text
+    assert "the other axes at their best: modes 3, alpha 1e-5, beta 1." in text
     # By K = 3: over all its configurations, the best of them, along the panel.
     everything = [mean(score, c, 0, 2) + 5 for c in GRID if c["modes"] == 3]
     std = statistics.stdev(everything)
