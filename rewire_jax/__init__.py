@@ -21,6 +21,8 @@ from rewire_jax.scenarios import (
     make_scenario,
     register_scenario,
 )
+from rewire_jax.sweeping import sweep
+from rewire_jax.sweepreport import write_sweep_report
 
 __all__ = [
     "SacSettings",
@@ -39,6 +41,8 @@ __all__ = [
     "preset",
     "register_method",
     "register_scenario",
+    "sweep",
     "train",
     "write_report",
+    "write_sweep_report",
 ]

@@ -7,18 +7,26 @@ import io
 import itertools
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
 import tyro
 
-from rewire_jax import continual, inspection, report
+from rewire_jax import (
+    continual,
+    inspection,
+    population,
+    report,
+    sweeping,
+    sweepreport,
+)
 from rewire_jax.config import Settings, require
 from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS
 from rewire_jax.presets import preset
-from rewire_jax.scenarios import list_scenarios, make_scenario
+from rewire_jax.scenarios import Scenario, list_scenarios, make_scenario
 
 T = TypeVar("T")
 
@@ -38,6 +46,39 @@ class Train:
     out: Path
     resume: bool = False
     tensorboard: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Trains every combination of settings with every seed as one population.
+
+    Several values make a setting an axis: --k 1 2 3, --alpha 0 1e-6 1e-5,
+    --beta 0.1 1 10, and any other number by --axis NAME VALUE ..., such as --axis tau
+    0.1 1 or --axis lr-policy 1e-4 1e-3. All members learn a task before the next.
+
+    Attributes:
+      settings: of all members.
+      out: folder of the sweep, new or empty.
+      resume: continue the sweep in that folder.
+      random: so many random configurations, with the axes' two values as ranges,
+        instead of every combination.
+      halving: after each task only the best 1 in so many configurations go on.
+      members_per_batch: trained side by side at most; 0 for as many as fit.
+      coordinator: HOST:PORT of the first of several processes, on one file system;
+        give each the same command.
+      processes: how many there are, where no cluster manager says so.
+      process: number of this one from 0, where no cluster manager says so.
+    """
+
+    settings: Settings
+    out: Path
+    resume: bool = False
+    random: int = 0
+    halving: int = 1
+    members_per_batch: int = 0
+    coordinator: str | None = None
+    processes: int | None = None
+    process: int | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -119,7 +160,10 @@ def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) ->
         raise UserError(" ".join(" ".join(said).split())) from None
 
 
-def _train(arguments: Sequence[str]) -> None:
+def _with_settings(
+    kind: Callable[..., T], name: str, arguments: Sequence[str]
+) -> tuple[Scenario, T]:
+    """Reads arguments that begin with a scenario and hold settings of a run."""
     # The settings' defaults depend on these four, so they are read before the rest.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--method", default="rewire")
@@ -129,18 +173,25 @@ def _train(arguments: Sequence[str]) -> None:
     given = bool(arguments) and not arguments[0].startswith("-")
     require(
         given or "--help" in arguments or "-h" in arguments,
-        "train needs a scenario: see `rewire-jax list`",
+        f"{name} needs a scenario: see `rewire-jax list`",
     )
-    name = arguments[0] if given else "halfcheetah/forgetting"
-    scenario = make_scenario(name, known.backend)
+    which = arguments[0] if given else "halfcheetah/forgetting"
+    scenario = make_scenario(which, known.backend)
     default = preset(scenario, known.method, known.profile)
-    train = parse(
-        Train,
-        "train SCENARIO",
-        arguments[1:] if given else arguments,
-        default=Train(settings=default, out=tyro.MISSING),
-        config=(tyro.conf.OmitArgPrefixes,),
+    return (
+        scenario,
+        parse(
+            kind,  # type: ignore[arg-type]
+            f"{name} SCENARIO",
+            arguments[1:] if given else arguments,
+            default=kind(settings=default, out=tyro.MISSING),
+            config=(tyro.conf.OmitArgPrefixes,),
+        ),
     )
+
+
+def _train(arguments: Sequence[str]) -> None:
+    scenario, train = _with_settings(Train, "train", arguments)
     folder = continual.train(
         train.settings,
         train.out,
@@ -149,6 +200,54 @@ def _train(arguments: Sequence[str]) -> None:
         tensorboard=train.tensorboard,
     )
     print(f"finished: results, checkpoints and settings are in {folder}")
+
+
+def _axes(arguments: Sequence[str]) -> tuple[dict[str, list[float]], list[str]]:
+    """The axes of a sweep by name, and the other arguments."""
+    short = {"k": "modes", "alpha": "alpha", "beta": "beta"}
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in short:
+        parser.add_argument(f"--{name}", nargs="*")
+    parser.add_argument("--axis", nargs="*", action="append", default=[])
+    known, others = parser.parse_known_args(arguments)
+    given = [[n, *getattr(known, n)] for n in short if getattr(known, n) is not None]
+    axes: dict[str, list[float]] = {}
+    for words in [*given, *known.axis]:
+        require(len(words) > 1, f"an axis needs a name and values, not {words}")
+        name, *values = words
+        name = short.get(name, name.lstrip("-").replace("-", "_"))
+        require(name not in axes, f"{name} is an axis twice")
+        try:
+            axes[name] = [float(value) for value in values]
+        except ValueError as error:
+            raise UserError(f"axis {name}: {error}") from None
+    return axes, others
+
+
+def _sweep(arguments: Sequence[str]) -> None:
+    axes, others = _axes(arguments)
+    # Processes join before JAX looks for its devices, as making a scenario does.
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--coordinator")
+    first.add_argument("--processes", type=int)
+    first.add_argument("--process", type=int)
+    known, _ = first.parse_known_args(others)
+    if known.coordinator:
+        population.join(known.coordinator, known.processes, known.process)
+    scenario, asked = _with_settings(Sweep, "sweep", others)
+    folder = sweeping.sweep(
+        asked.settings,
+        asked.out,
+        axes=axes,
+        random=asked.random,
+        halving=asked.halving,
+        members_per_batch=asked.members_per_batch,
+        scenario=scenario,
+        resume=asked.resume,
+    )
+    if jax.process_index() == 0:
+        written = sweepreport.write_sweep_report(folder)
+        print(written.title, *written.notes, *written.paths, sep="\n")
 
 
 def _evaluate(arguments: Sequence[str]) -> None:
@@ -203,6 +302,7 @@ def _list(arguments: Sequence[str]) -> None:
 
 _COMMANDS = {
     "train": _train,
+    "sweep": _sweep,
     "evaluate": _evaluate,
     "report": _report,
     "info": _info,
@@ -213,6 +313,8 @@ _USAGE = """usage: rewire-jax COMMAND ...
   train SCENARIO --out RUN [--method M] [--profile P] [--resume] [--SETTING VALUE ...]
       learn the tasks of a scenario, one after the other
       (`rewire-jax train SCENARIO --help` lists all settings and their values)
+  sweep SCENARIO --out SWEEP [--k 1 2 3] [--axis NAME VALUE ...] [--SETTING VALUE ...]
+      the same for every combination of settings and every seed, as one program
   evaluate RUN    play the tasks of a run with what it has learned
   report RUN...   tables and pictures of runs, side by side
   info SCENARIO   tasks, budgets, backend, and the model size of each method

@@ -9,6 +9,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from rewire_jax.config import SacSettings
+from rewire_jax.errors import UserError
 
 _AXIS = "members"
 
@@ -70,6 +71,28 @@ def stack(crowd: Sequence[Member]) -> Members:
         sac=stacked([member.sac for member in crowd]),
         options=stacked([member.options for member in crowd]),
     )
+
+
+def join(coordinator: str, processes: int | None, process: int | None) -> None:
+    """Makes this process one of several that share the work.
+
+    Args:
+      coordinator: `host:port` of the first process.
+      processes: how many there are; None where a cluster manager that JAX knows
+        tells it this, and which process this is.
+      process: number of this process.
+
+    Raises:
+      UserError: numbers are missing or wrong, or the others cannot be reached.
+    """
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (ValueError, TypeError, RuntimeError) as error:
+        said = str(error).partition("\n")[0]
+        raise UserError(
+            f"--coordinator {coordinator}: {said} Check the address, --processes and "
+            "--process."
+        ) from error
 
 
 def mesh(members: int) -> Mesh:
