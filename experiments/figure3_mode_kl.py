@@ -20,7 +20,10 @@ QUANTITY = "KL divergence between modes"
 
 
 class Pattern(NamedTuple):
-    """What becomes of a curve, told by its means over a tenth of the reports.
+    """What becomes of a curve, told by its medians over a tenth of the reports.
+
+    Not by means: a state for which one mode is nearly sure of its action can make the
+    divergence in a report a thousand times that in its neighbours.
 
     Attributes:
       at: interactions around which it is highest.
@@ -45,25 +48,25 @@ class Pattern(NamedTuple):
 
 def pattern(x: Array, values: Array, window: int) -> Pattern:
     """What becomes of the values `[points]` at these interactions."""
-    over, means = (
-        np.lib.stride_tricks.sliding_window_view(each, window).mean(axis=-1)
+    over, middle = (
+        np.median(np.lib.stride_tricks.sliding_window_view(each, window), axis=-1)
         for each in (x, values)
     )
-    highest = np.nanargmax(means)
-    return Pattern(over[highest], means[highest], means[-1])
+    highest = np.nanargmax(middle)
+    return Pattern(over[highest], middle[highest], middle[-1])
 
 
 def tell(curve: Curve) -> str:
     """Whether modes diverge and converge, in Markdown."""
     window = first_task.tenth(curve)
-    mean = pattern(curve.x, curve.mean, window)
+    median = pattern(curve.x, curve.median, window)
     seeds = [pattern(curve.x, values, window).converges for values in curve.values]
     return (
         f"- {curve.label}: diverge-and-converge "
-        f"**{'appears' if mean.converges else 'does not appear'}** in the mean, and "
-        f"appears in {sum(seeds)} of {len(seeds)} seeds. The mean is highest around "
-        f"{mean.at:,.0f} interactions, {number(mean.peak)}, and {number(mean.end)} at "
-        f"the end, {mean.share:.0%} of that."
+        f"**{'appears' if median.converges else 'does not appear'}** in the median "
+        f"over seeds, and appears in {sum(seeds)} of {len(seeds)} seeds. The median is "
+        f"highest around {median.at:,.0f} interactions, {number(median.peak)}, and "
+        f"{number(median.end)} at the end, {median.share:.0%} of that."
     )
 
 
@@ -79,7 +82,7 @@ def run(job: FirstTask) -> None:
     found = first_task.read("Figure 3", runs, LABELS, "mode_divergence")
     notes = (
         "Diverge-and-converge is said to appear where the divergence ends below half "
-        "of its peak, both taken over a tenth of the progress reports.",
+        "of its peak, both being medians over a tenth of the progress reports.",
         "",
         *map(tell, found.curves.values()),
         "",

@@ -120,20 +120,21 @@ def test_runs_with_nothing_to_show_are_left_out(tmp_path):
 
 def test_peak_and_end_of_a_curve():
     values = np.zeros(POINTS)
-    values[4], values[9:11], values[-2:] = 6, 8, 3
-    # A single high report is no peak where two are averaged.
-    found = pattern(X, values, 2)
-    assert found == (10.5, 8, 3)
+    values[4], values[9:12], values[-3:] = 1000, (8, 8, 90), (9, 3, 3)
+    # A single high report neither is a peak nor spoils one, nor the end.
+    found = pattern(X, values, 3)
+    assert found == (10, 8, 3)
     assert found.converges
-    assert not pattern(X, values + 3, 2).converges
-    assert not pattern(X, X, 2).converges
+    assert not pattern(X, values + 3, 3).converges
+    assert not pattern(X, X, 3).converges
+    assert not pattern(X, 0 * X, 3).converges
     values[0] = np.nan
-    assert pattern(X, values, 2) == (10.5, 8, 3)
+    assert pattern(X, values, 3) == found
 
 
 def test_what_is_told_of_the_modes():
     rising, falling = np.linspace(1, 9, POINTS), np.linspace(9, 0.9, POINTS)
-    told = tell(Curve("with", X, np.stack([falling, falling, rising])))
+    told = tell(Curve("with", X, np.stack([rising, rising, 1e3 * falling])))
     assert told.startswith("- with: diverge-and-converge **does not appear** in the")
-    assert "appears in 2 of 3 seeds" in told
-    assert "**appears** in the mean" in tell(Curve("with", X, falling[None]))
+    assert "appears in 1 of 3 seeds" in told
+    assert "**appears** in the median" in tell(Curve("with", X, falling[None]))
