@@ -1,0 +1,225 @@
+"""What a member needs of a device's memory, known before anything is compiled.
+
+What is held is counted from shapes. What computing takes beside it is counted from the
+traced operations: the most that is alive at once, if each result is kept from where it
+is made to its last use. XLA needs less where it fuses operations, and more where it
+copies.
+"""
+
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
+
+from rewire_jax import training
+from rewire_jax.config import require
+from rewire_jax.methods import find_method
+from rewire_jax.plan import Plan
+
+# Of a device's memory; the rest is for compiled code and what others hold.
+_SHARE = 0.8
+# Beyond these the results of one operation have left a CPU's caches before the next
+# one reads them: at 32, each member takes a quarter longer than alone.
+_SIDE_BY_SIDE = 8
+
+
+class Need(NamedTuple):
+    """Bytes that one member needs.
+
+    Attributes:
+      learner: all that learning changes.
+      buffer: the replay buffer, held in training.
+      environments: held in training.
+      work: taken for a while beside these, by an update, a step or a choice.
+      evaluation: taken beside the learner, when there is no buffer.
+    """
+
+    learner: int
+    buffer: int
+    environments: int
+    work: int
+    evaluation: int
+
+    @property
+    def total(self) -> int:
+        """The most at any one time."""
+        training = self.buffer + self.environments + self.work
+        return self.learner + max(training, self.evaluation)
+
+    def __str__(self) -> str:
+        pairs = zip(self._fields, self, strict=True)
+        parts = ", ".join(f"{name} {size / 1e6:.3g}" for name, size in pairs)
+        return f"a member needs {self.total / 1e6:.3g} MB: {parts}"
+
+
+def need(plan: Plan) -> Need:
+    """Counts what each member of a plan needs; traces, but compiles nothing."""
+    program, settings, spec = plan.program, plan.settings, plan.spec
+    environment, make = plan.scenario.environment, find_method(settings.method).make
+    task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+    fresh = jax.eval_shape(program.init, plan.members)
+    alive = jax.ShapeDtypeStruct((plan.places,), bool)
+    state = jax.eval_shape(program.begin, plan.members, fresh, alive, 0, task)
+    policies = jax.eval_shape(program.policies, plan.members, fresh)
+
+    def learn(member, state):
+        return training.learn(
+            member.keys,
+            state,
+            jnp.asarray(1),
+            jnp.asarray(0),
+            settings.updates,
+            environment=environment,
+            method=make(spec, member.options),
+            settings=member.sac,
+        )
+
+    def step(member, task, policy, now):
+        mean, _ = make(spec, member.options).act(policy, now.observation)
+        return environment.step(task, now, mean)
+
+    def one(tree: Any) -> Any:
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), tree)
+
+    member, mine, policies = one(plan.members), one(state), one(policies)
+    start = jax.eval_shape(environment.reset, task, member.keys)
+    episode = max(
+        peak(environment.reset, task, member.keys),
+        size(start) + peak(step, member, task, one(policies), start),
+    )
+    learner = size(mine.learner)
+    work = [
+        learner,  # a task's start and end each make one from the other
+        peak(learn, member, mine),
+        episode * settings.envs,
+    ]
+    if program.consolidate:
+        work.append(peak(program.consolidate, plan.members, state, 0, 1) // plan.places)
+    if program.candidates and plan.rows:
+        chosen = one(jax.eval_shape(program.candidates, plan.members, fresh, 0))
+        share = size(chosen.policies) // chosen.valid.size
+        work.append(plan.rows * (share + episode * settings.selection_episodes))
+    return Need(
+        learner=learner,
+        buffer=size(mine.collection.buffer),
+        environments=size(mine.collection) - size(mine.collection.buffer),
+        work=max(work),
+        evaluation=size(policies) + episode * settings.tasks * settings.eval_episodes,
+    )
+
+
+def size(tree: Any) -> int:
+    """Bytes of a pytree's arrays, which may be abstract."""
+    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def peak(function: Callable[..., Any], *arguments: Any) -> int:
+    """Bytes that a function's results take at most at a time, beside its arguments."""
+    return _peak(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _peak(jaxpr: Jaxpr) -> int:
+    last = {
+        v: i for i, e in enumerate(jaxpr.eqns) for v in (*e.outvars, *_variables(e))
+    }
+    last |= dict.fromkeys((v for v in jaxpr.outvars if isinstance(v, Var)), -1)
+    held: dict[Var, int] = {}
+    alive = most = 0
+    for index, equation in enumerate(jaxpr.eqns):
+        made = {v: size(v.aval) for v in equation.outvars}
+        given = sum(made.values())
+        inside = max(map(_peak, jaxprs_in_params(equation.params)), default=0)
+        if equation.primitive.name in ("scan", "while"):
+            # What it carries is kept while the next is made.
+            inside += given
+        most = max(most, alive + max(inside, given))
+        held |= made
+        held = {v: bytes for v, bytes in held.items() if last[v] != index}
+        alive = sum(held.values())
+    return most
+
+
+def _variables(equation: JaxprEqn) -> list[Var]:
+    return [v for v in equation.invars if isinstance(v, Var)]
+
+
+def device_bytes(devices: Sequence[jax.Device]) -> int:
+    """Bytes on these devices together that members may take.
+
+    Raises:
+      UserError: a device does not tell.
+    """
+    if devices[0].platform == "cpu":
+        # All CPU devices are one machine.
+        return int(_SHARE * machine_bytes())
+    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in devices]
+    known = [limit for limit in limits if limit]
+    require(
+        len(known) == len(limits),
+        f"{devices[0].device_kind} does not tell its memory: give --members-per-batch",
+    )
+    return int(_SHARE * sum(known))
+
+
+def machine_bytes(root: Path = Path("/")) -> int:
+    """Bytes of the machine's memory, or of this process's share of it (cgroups).
+
+    Args:
+      root: of the file system.
+    """
+    pages, page = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+    return min([pages * page, *_limits(root)])
+
+
+def _limits(root: Path) -> Iterator[int]:
+    """Of the control groups that the process is in; there are two versions of them."""
+    try:
+        groups = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:  # not Linux
+        return
+    for group in groups:
+        _, controllers, path = group.split(":", 2)
+        if "memory" in controllers.split(","):
+            top, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+        elif not controllers:
+            top, name = root / "sys/fs/cgroup", "memory.max"
+        else:
+            continue
+        inner = top / path.lstrip("/")
+        for folder in (inner, *inner.parents):
+            # In a container the path may be one of the machine outside.
+            text = _text(folder / name)
+            if text.isdecimal():  # not "max"
+                yield int(text)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""
+
+
+def fitting(plan: Plan, devices: Sequence[jax.Device]) -> int:
+    """How many of a plan's members are best trained side by side on these devices.
+
+    Raises:
+      UserError: there is no room for one.
+    """
+    each, room = need(plan), device_bytes(devices)
+    # On a CPU all devices take from the same room.
+    shares = 1 if devices[0].platform == "cpu" else len(devices)
+    number = shares * (room // shares // each.total)
+    require(
+        number > 0,
+        f"{each}; there are {room / shares / 1e6:.3g} MB: lower --buffer, --envs or "
+        "--eval-episodes, or give --members-per-batch to try",
+    )
+    if devices[0].platform == "cpu":
+        number = min(number, _SIDE_BY_SIDE * len(devices))
+    return number
