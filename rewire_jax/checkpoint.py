@@ -18,11 +18,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint._src.multihost import multihost
 
 from rewire_jax.errors import UserError
 
@@ -195,15 +197,13 @@ def _orbax() -> Iterator[ocp.Checkpointer]:
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)  # It logs tracebacks when the disk is full.
     try:
-        # Processes that work together write folders of their own, and do not wait.
-        process = jax.process_index()
-        options = ocp.options.MultiprocessingOptions(
-            primary_host=process,
-            active_processes={process},
-            barrier_sync_key_prefix=str(process),
-        )
+        # Processes that work together write folders of their own, and do not wait. But
+        # Orbax has only the first of them write arrays of the host.
+        options = ocp.options.MultiprocessingOptions(active_processes={0})
         handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
-        with ocp.Checkpointer(handler, multiprocessing_options=options) as orbax:
+        alone = mock.patch.object(multihost, "process_index", return_value=0)
+        checkpointer = ocp.Checkpointer(handler, multiprocessing_options=options)
+        with alone, checkpointer as orbax:
             yield orbax
     finally:
         logger.setLevel(level)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import rewire_jax
-from rewire_jax import axes, continual, networks, plan, standing, sweeping
+from rewire_jax import axes, cli, continual, networks, plan, standing, sweeping
 from rewire_jax.config import Settings
 from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS, Entry
@@ -280,7 +280,8 @@ def sweep(folder: Path, settings: Settings, **options) -> Path:
 
 def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
     # Seven members in places for eight.
-    settings = small(sac=dataclasses.replace(small().sac, hidden=15))
+    sac = dataclasses.replace(small().sac, hidden=15)
+    settings = dataclasses.replace(small(), sac=sac)
     axis = {"beta": [1, 2, 3, 4, 5, 6, 7]}
     folder = sweep(tmp_path / "s", settings, axes=axis, members_per_batch=4)
     shared, crowd = sweeping._crowd(settings, axes.grid(axis))
@@ -340,17 +341,26 @@ def test_settings_that_make_no_sense_are_said(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
-def test_another_sweep_or_a_run_is_not_resumed(swept: Path, tmp_path: Path) -> None:
+def fails(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command ends with 2 and one line that says what is wrong."""
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(words)
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+
+
+def test_another_sweep_or_a_run_is_not_resumed(
+    swept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for more, said in (
         ([], "holds another run"),
         (["--resume", "--halving", "2"], "other axes, seeds or halving"),
         (["--resume", "--seeds", "2"], "other settings: --seeds"),
         (["--resume", "--axis", "tau", "1", "2"], "other axes"),
     ):
-        done = run([*command(swept), *more])
-        assert done.returncode == 2
-        assert said in done.stderr
-        assert len(done.stderr.splitlines()) == 1
+        fails([*command(swept)[3:], *more], said, capsys)
     with pytest.raises(UserError, match="holds a sweep, not a run"):
         rewire_jax.load_policy(swept, task=0)
 
@@ -369,14 +379,13 @@ def test_another_sweep_or_a_run_is_not_resumed(swept: Path, tmp_path: Path) -> N
     ],
 )
 def test_wrong_arguments_end_in_one_line(
-    words: list[str], said: str, tmp_path: Path
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    where = ["--out", str(tmp_path / "sweep")]
-    base = [sys.executable, "-m", "rewire_jax.cli", "sweep", "probe/reach"]
-    done = run([*base, *words, *where])
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    out = str(tmp_path / "sweep")
+    fails(["sweep", "probe/reach", *words, "--out", out], said, capsys)
     assert not (tmp_path / "sweep").exists()
 
 
@@ -447,7 +456,7 @@ def test_one_mode_is_ft_l2_with_a_permutation(
     shared = {"selection_episodes": 0, "seed": 5, "interactions": 640}
     options = RewireSettings(alignment="off", noise=0.0, tau=0.5, beta=0.3, alpha=1.0)
     sac = dataclasses.replace(small().sac, hidden=13, lr_policy=1e-2)
-    settings = small(options=options, sac=sac, **shared)
+    settings = dataclasses.replace(small(**shared), options=options, sac=sac)
     swept = sweep(tmp_path / "sweep", settings, axes={"modes": [3, 1]})
     plain = dataclasses.replace(
         settings, method="permuted_l2", options=FtL2Settings(coefficient=0.3)
