@@ -128,4 +128,7 @@ def compiled(
     local = jax.shard_map(
         function, mesh=mesh, in_specs=shares, out_specs=P(_AXIS), check_vma=False
     )
-    return jax.jit(local, donate_argnums=donate)
+    # Said for one device, too: else its results and what `place` gives are two kinds of
+    # arguments, for which a function is traced twice.
+    spread = NamedSharding(mesh, P(_AXIS))
+    return jax.jit(local, donate_argnums=donate, out_shardings=spread)
