@@ -32,8 +32,12 @@ def run(job: FirstTask) -> None:
     """
     runs = suite.train(job.runs(job.scenario, VARIANTS), job)
     found = first_task.read("Figure 5", runs, LABELS)
+    notes = (
+        "A run's environments start their episodes together, and from rest: the dips.",
+        "",
+    )
     path = job.folder("figure5") / "figure5"
-    first_task.write(path, "training return", found, PANELS)
+    first_task.write(path, "training return", found, PANELS, notes)
 
 
 if __name__ == "__main__":
