@@ -1,0 +1,227 @@
+"""Populations of several sizes: compile time, memory, and time per member.
+
+Each size is measured in a process of its own, so that no other's memory is in its
+peak. Interactions are taken with all their updates, round after round, and the best
+round counts.
+"""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from matplotlib.ticker import NullLocator, ScalarFormatter
+
+import rewire_jax
+from experiments import suite
+from rewire_jax import figures, memory
+from rewire_jax.config import require
+from rewire_jax.plan import prepare
+
+READING = (
+    "A population is members side by side in one compiled function. Times are of "
+    "training, environments and updates, in the best round; processor time is that of "
+    "all threads. Planned is what the compiler plans for a chunk of training, "
+    "arguments and temporary arrays; estimated is what `rewire_jax.memory` counts for "
+    "the same before anything is compiled. The peak is the process's, with all that "
+    "compiling takes, or the device's where it has memory of its own. Compile time is "
+    "that of a chunk, traced and without a cache of earlier compilations."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Population:
+    """What to measure.
+
+    Attributes:
+      members: sizes of the populations, the smallest first.
+      scenario: on which.
+      method: by which.
+      profile: whose sizes.
+      rounds: how often each is timed.
+      steps: of all environments in a round.
+      out: the result files, without a suffix; named after the device if not given.
+      measure: measures a single size in this process, and prints it as JSON.
+    """
+
+    members: tuple[int, ...] = (1, 8, 32)
+    scenario: str = "halfcheetah/forgetting"
+    method: str = "rewire"
+    profile: str = "quick"
+    rounds: int = 5
+    steps: int = 10
+    out: Path | None = None
+    measure: bool = False
+
+
+def measure(job: Population, members: int) -> dict[str, Any]:
+    """Measures a population in this process; a row of the result."""
+    scenario = rewire_jax.make_scenario(job.scenario)
+    settings = rewire_jax.preset(scenario, job.method, job.profile)
+    plan = prepare(replace(settings, seeds=members), scenario)
+    program, crowd = plan.program, plan.members
+    task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+    alive = jnp.ones(members, bool)
+    state = program.begin(crowd, program.init(crowd), alive, 0, task)
+    began, used = time.perf_counter(), time.process_time()
+    lowered = program.chunk.lower(crowd, state, 0, task, 0, 1)  # type: ignore
+    chunk = lowered.compile()
+    compiling = time.perf_counter() - began, time.process_time() - used
+    # Up to where updates begin.
+    done = settings.warmup // settings.envs
+    state, _ = chunk(crowd, state, 0, task, 0, done)
+    rounds = []
+    for _ in range(job.rounds):
+        jax.block_until_ready(state)
+        began, used = time.perf_counter(), time.process_time()
+        state, _ = chunk(crowd, state, 0, task, done, job.steps)
+        jax.block_until_ready(state)
+        rounds.append((time.perf_counter() - began, time.process_time() - used))
+        done += job.steps
+    # The estimate's own traces are no part of the times.
+    need = memory.need(plan)
+    planned = chunk.memory_analysis()
+    taken = members * job.steps * settings.envs
+    wall, processor = (min(times) / taken for times in zip(*rounds, strict=True))
+    return {
+        "members": members,
+        "side_by_side": memory.fitting(memory.need(plan), jax.local_devices()),
+        "compile_seconds": compiling[0],
+        "compile_processor_seconds": compiling[1],
+        "seconds": wall,
+        "processor_seconds": processor,
+        "estimated": need.learner + need.buffer + need.environments + need.work,
+        "argument": planned.argument_size_in_bytes / members,
+        "temporary": planned.temp_size_in_bytes / members,
+        "output": planned.output_size_in_bytes / members,
+        "peak": peak(),
+    }
+
+
+def peak() -> int:
+    """Bytes that the device has held at most, or this process on a CPU."""
+    stats = jax.devices()[0].memory_stats() or {}
+    kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # as Linux has it
+    return stats.get("peak_bytes_in_use", 1024 * kilobytes)
+
+
+def apart(job: Population, members: int) -> dict[str, Any]:
+    """Measures a population in a process of its own.
+
+    Raises:
+      UserError: it failed; what it said has been shown.
+    """
+    command = [sys.executable, "-m", "experiments.population", "--measure"]
+    for name in ("scenario", "method", "profile", "rounds", "steps"):
+        command += [f"--{name}", str(getattr(job, name))]
+    done = subprocess.run(
+        [*command, "--members", str(members)],
+        env=os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    require(done.returncode == 0, f"measuring {members} members failed")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """A line for each size."""
+    shown = {
+        "members": lambda row: f"{row['members']}",
+        "compile, s": lambda row: f"{row['compile_seconds']:.0f}",
+        "processor s": lambda row: f"{row['compile_processor_seconds']:.0f}",
+        "estimated, MB a member": lambda row: f"{row['estimated'] / 1e6:.1f}",
+        "planned, MB a member": lambda row: (
+            f"{(row['argument'] + row['temporary']) / 1e6:.1f}"
+        ),
+        "peak, MB": lambda row: f"{row['peak'] / 1e6:,.0f}",
+        "ms a member and interaction": lambda row: f"{1e3 * row['seconds']:.3g}",
+        "processor ms": lambda row: f"{1e3 * row['processor_seconds']:.3g}",
+    }
+    return [list(shown), *([cell(row) for cell in shown.values()] for row in rows)]
+
+
+def headline(rows: Sequence[Mapping[str, Any]], key: str) -> list[str]:
+    """Markdown: what the larger populations cost, in units of the smallest.
+
+    Args:
+      rows: the smallest first.
+      key: by which time.
+    """
+    first, *others = rows
+    lines = [
+        f"- {row['members']} members cost "
+        f"**{row['members'] * row[key] / (first['members'] * first[key]):.3g} times** "
+        f"what {first['members']} costs: per member {row[key] / first[key]:.2f} times."
+        for row in others
+    ]
+    most = first["side_by_side"]
+    return [*lines, f"- A sweep trains at most {most} side by side on this device."]
+
+
+def draw(rows: Sequence[Mapping[str, Any]], key: str, path: Path) -> None:
+    """Writes the picture: time per member against members."""
+    figure, (axes,) = figures.empty((7.0, 4.2), 1, 1)
+    members = [row["members"] for row in rows]
+    axes.plot(members, [1e3 * row[key] for row in rows], marker="o", **figures.look(0))
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(members)
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("members side by side")
+    axes.set_ylabel("ms a member and interaction")
+    axes.grid(color="0.9")
+    axes.set_axisbelow(True)
+    clock = key.replace("_seconds", " time").replace("seconds", "wall clock")
+    figures.entitle(figure, f"Time per member, {jax.devices()[0].device_kind}", clock)
+    figure.savefig(path)
+
+
+def run(job: Population) -> None:
+    """Measures all sizes, and writes the result; or a single one.
+
+    Raises:
+      UserError: wrong arguments, or a measurement failed.
+    """
+    require(
+        min(job.members, default=0) > 0 and min(job.rounds, job.steps) > 0,
+        "--members, --rounds and --steps must be at least 1",
+    )
+    if job.measure:
+        print(json.dumps(measure(job, job.members[0])))
+        return
+    before = os.getloadavg()[0]
+    rows = [apart(job, members) for members in sorted(job.members)]
+    after = os.getloadavg()[0]
+    device = jax.devices()[0]
+    # What else a machine does is in its clock, but not in this process's time.
+    key = "processor_seconds" if device.platform == "cpu" else "seconds"
+    name = device.device_kind.lower().replace(" ", "-")
+    out = job.out or suite.RESULTS / f"population-{name}"
+    cores = len(os.sched_getaffinity(0))
+    notes = (
+        *headline(rows, key),
+        "",
+        READING,
+        "",
+        f"{job.method} on {job.scenario}, {job.profile} profile; {device.device_kind}, "
+        f"{cores} cores for this, load {before:.1f} to {after:.1f}; best of "
+        f"{job.rounds} rounds of {job.steps} steps.",
+    )
+    suite.write(out, "Members side by side", table(rows), notes, rows)
+    draw(rows, key, out.with_suffix(".png"))
+    print(out.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    suite.command(Population, run, "population")
