@@ -205,13 +205,13 @@ def _text(path: Path) -> str:
         return ""
 
 
-def fitting(plan: Plan, devices: Sequence[jax.Device]) -> int:
-    """How many of a plan's members are best trained side by side on these devices.
+def fitting(each: Need, devices: Sequence[jax.Device]) -> int:
+    """How many such members are best trained side by side on these devices.
 
     Raises:
       UserError: there is no room for one.
     """
-    each, room = need(plan), device_bytes(devices)
+    room = device_bytes(devices)
     # On a CPU all devices take from the same room.
     shares = 1 if devices[0].platform == "cpu" else len(devices)
     number = shares * (room // shares // each.total)

@@ -14,6 +14,7 @@ import contextlib
 import functools
 import json
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -275,13 +276,19 @@ def sweep(
         f"{folder} was started with other axes, seeds or halving: give the same again "
         "or name another --out",
     )
+    need = memory.need(plan)
+    most = members_per_batch or memory.fitting(need, jax.local_devices())
+    print(
+        f"{need}; {min(most, len(crowd))} of {len(crowd)} members side by side",
+        file=sys.stderr,
+    )
     Sweep(
         folder=folder,
         settings=plan.settings,
         scenario=scenario,
         crowd=crowd,
         halving=halving,
-        most=members_per_batch or memory.fitting(plan, jax.local_devices()),
+        most=most,
         progress=progress,
     ).run()
     return folder

@@ -162,31 +162,31 @@ def devices(number, platform="gpu", **stats):
 
 
 def test_as_many_members_as_the_devices_hold():
-    plan = prepare(settings())
-    total = memory.need(plan).total
+    need = needed()
+    total = need.total
     # Four fifths of a device are ours; no member is cut in two.
     limit = int(3.5 * total / 0.8)
     assert memory.device_bytes(devices(2, bytes_limit=limit)) == pytest.approx(
         7 * total
     )
-    assert memory.fitting(plan, devices(1, bytes_limit=limit)) == 3
-    assert memory.fitting(plan, devices(2, bytes_limit=limit)) == 6
+    assert memory.fitting(need, devices(1, bytes_limit=limit)) == 3
+    assert memory.fitting(need, devices(2, bytes_limit=limit)) == 6
     with pytest.raises(UserError, match=r"a member needs .* lower --buffer"):
-        memory.fitting(plan, devices(1, bytes_limit=total))
+        memory.fitting(need, devices(1, bytes_limit=total))
     with pytest.raises(UserError, match="give --members-per-batch"):
-        memory.fitting(plan, devices(1))
+        memory.fitting(need, devices(1))
 
 
 def test_devices_of_a_cpu_share_the_machine(monkeypatch):
-    plan = prepare(settings())
-    total = memory.need(plan).total
+    need = needed()
+    total = need.total
     cpus = devices(4, "cpu")
     monkeypatch.setattr(memory, "machine_bytes", lambda: int(10.5 * total / 0.8))
-    assert memory.fitting(plan, cpus[:1]) == 8
-    assert memory.fitting(plan, cpus) == 10
+    assert memory.fitting(need, cpus[:1]) == 8
+    assert memory.fitting(need, cpus) == 10
     monkeypatch.setattr(memory, "machine_bytes", lambda: 1000 * total)
-    assert memory.fitting(plan, cpus[:1]) == 8
-    assert memory.fitting(plan, cpus) == 32
+    assert memory.fitting(need, cpus[:1]) == 8
+    assert memory.fitting(need, cpus) == 32
 
 
 @pytest.mark.parametrize(

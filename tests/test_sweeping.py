@@ -108,6 +108,10 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = run(command(folder))
     assert done.returncode == 0, done.stderr
     assert "24 configurations" in done.stdout
+    # Known before anything is compiled, and so said first.
+    first, *later = done.stderr.splitlines()
+    assert re.match(r"a member needs .* MB: learner .*; 12 of 24 members side", first)
+    assert all("finished in" in line for line in later)
     for name in ("members.csv", "configurations.csv", "sweep.md", "panels.png"):
         assert str(folder / name) in done.stdout
         assert (folder / name).stat().st_size > 0
