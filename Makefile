@@ -5,6 +5,8 @@ VENV := .venv
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
 RUN := $(VENV)/bin/python
 STAMP := $(VENV)/.installed
+# A file's tests share what they train, so they stay in one process.
+WORKERS ?= -n 2 --dist loadfile
 
 comma := ,
 # $(call option,NAME,VALUE): `--NAME VALUE` where VALUE is set, else nothing.
@@ -67,10 +69,10 @@ format: setup ## Mend what ruff can mend
 	$(RUN) -m ruff format
 
 test: lint ## Set up, lint, run all tests but the slow ones
-	$(RUN) -m pytest -m 'not slow'
+	$(RUN) -m pytest -m 'not slow' $(WORKERS)
 
 test-slow: setup ## Run the slow tests
-	$(RUN) -m pytest -m slow
+	$(RUN) -m pytest -m slow $(WORKERS)
 
 bench-brax: setup ## Run the methods on a Brax scenario, make its table and figures
 	$(RUN) -m experiments.bench_brax $(strip \
