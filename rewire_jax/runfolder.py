@@ -90,7 +90,7 @@ def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
     try:
         header = json.loads((folder / HEADER).read_text())
     except OSError as error:
-        raise UserError(f"{folder} holds no run: {HEADER} cannot be read") from error
+        raise UserError(f"{folder} holds no {kind}: {HEADER} cannot be read") from error
     except ValueError as error:
         raise UserError(f"{folder / HEADER} is damaged: {error}") from error
     if not isinstance(header, dict) or header.get("format") != FORMAT:

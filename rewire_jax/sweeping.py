@@ -266,9 +266,10 @@ def sweep(
         "episode_length": scenario.environment.episode_length,
         "provenance": runfolder.provenance(),
     }
-    if jax.process_index() == 0 and not resume:
+    if not resume and jax.process_index() == 0:
         runfolder.create(folder, header)
-    _wait((folder / runfolder.HEADER).exists)
+    elif not resume:
+        _wait((folder / runfolder.HEADER).exists)
     runfolder.compare(folder, plan.settings, "sweep")
     saved = runfolder.read_header(folder, "sweep")
     require(

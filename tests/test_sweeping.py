@@ -380,6 +380,7 @@ def test_another_sweep_or_a_run_is_not_resumed(
         (["--random", "3", "--beta", "1", "2", "3"], "needs a range"),
         (["--method", "ft1", "--alpha", "1"], "no sweep over 'alpha'"),
         (["--beta", "1", "--coordinator", "nowhere"], "--coordinator nowhere"),
+        (["--beta", "1", "--resume"], "holds no sweep"),
     ],
 )
 def test_wrong_arguments_end_in_one_line(
