@@ -172,12 +172,13 @@ def draw(rows: Sequence[Mapping[str, Any]], key: str, path: Path) -> None:
     """Writes the picture: time per member against members."""
     figure, (axes,) = figures.empty((7.0, 4.2), 1, 1)
     members = [row["members"] for row in rows]
-    axes.plot(members, [1e3 * row[key] for row in rows], marker="o", **figures.look(0))
+    times = [1e3 * row[key] for row in rows]
+    axes.plot(members, times, marker="o", **figures.look(0))
     axes.set_xscale("log", base=2)
     axes.set_xticks(members)
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.1 * max(times))
     axes.set_xlabel("members side by side")
     axes.set_ylabel("ms a member and interaction")
     axes.grid(color="0.9")
