@@ -38,9 +38,9 @@ def draws(
     """Random configurations, the same for the same seed in the settings.
 
     Args:
-      axes: name and range (low, high) of each setting. Whole numbers are drawn from
-        low to high; others log-uniformly where the range lies above 0 and spans a
-        factor of 10, else uniformly.
+      axes: name and range (low, high) of each setting, or one value that is kept.
+        Whole numbers are drawn from low to high; others log-uniformly where the range
+        lies above 0 and spans a factor of 10, else uniformly.
       number: of configurations.
       settings: tell which settings are whole numbers.
 
@@ -49,15 +49,19 @@ def draws(
     """
     kinds = names(settings)
     for name, values in axes.items():
-        _known(name, kinds)
+        for value in values:
+            _check(name, value, kinds)
         require(
-            len(values) == 2 and values[0] < values[1],
-            f"with --random, {config.flag(name)} needs a range, such as 0.1 10",
+            len(values) == 1 or (len(values) == 2 and values[0] < values[1]),
+            f"with --random, {config.flag(name)} needs a range, such as 0.1 10, or one "
+            "value",
         )
     generator = np.random.default_rng(settings.seed)
 
     def draw(name: str) -> float:
-        low, high = axes[name]
+        low, high = axes[name][0], axes[name][-1]
+        if low == high:
+            return low
         if kinds[name] is int:
             return int(generator.integers(int(low), int(high), endpoint=True))
         if low > 0 and high / low >= _DECADE:
@@ -77,12 +81,7 @@ def configure(settings: Settings, values: Mapping[str, float]) -> Settings:
     sac: dict[str, Any] = {}
     options: dict[str, Any] = {}
     for name, value in values.items():
-        _known(name, kinds)
-        if kinds[name] is int:
-            require(
-                value == int(value),
-                f"{config.flag(name)} must be a whole number, not {value:g}",
-            )
+        _check(name, value, kinds)
         group = sac if hasattr(settings.sac, name) else options
         group[name] = kinds[name](value)
     settings = dataclasses.replace(
@@ -99,8 +98,14 @@ def read(member: Member, name: str) -> float:
     return getattr(member.sac if hasattr(member.sac, name) else member.options, name)
 
 
-def _known(name: str, kinds: Mapping[str, type]) -> None:
+def _check(name: str, value: float, kinds: Mapping[str, type]) -> None:
     require(
         name in kinds,
         f"no sweep over {name!r}: choose among {', '.join(sorted(kinds))}",
+    )
+    flag = config.flag(name)
+    require(math.isfinite(value), f"{flag} must be finite, not {value}")
+    require(
+        kinds[name] is not int or value == int(value),
+        f"{flag} must be a whole number, not {value:g}",
     )

@@ -19,6 +19,7 @@ from rewire_jax import (
     inspection,
     population,
     report,
+    runfolder,
     sweeping,
     sweepreport,
 )
@@ -105,7 +106,8 @@ class Report:
     """Tables and pictures of runs on the same scenario, from their files alone.
 
     Attributes:
-      runs: folders of the runs, finished or not; a SAC-N run normalises the others.
+      runs: folders of the runs, finished or not; a SAC-N run normalises the others. Or
+        the folder of one sweep.
       out: folder for the report; an earlier report there is replaced.
     """
 
@@ -207,10 +209,10 @@ def _axes(arguments: Sequence[str]) -> tuple[dict[str, list[float]], list[str]]:
     short = {"k": "modes", "alpha": "alpha", "beta": "beta"}
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in short:
-        parser.add_argument(f"--{name}", nargs="*")
+        parser.add_argument(f"--{name}", nargs="*", action="append", default=[])
     parser.add_argument("--axis", nargs="*", action="append", default=[])
     known, others = parser.parse_known_args(arguments)
-    given = [[n, *getattr(known, n)] for n in short if getattr(known, n) is not None]
+    given = [[name, *values] for name in short for values in getattr(known, name)]
     axes: dict[str, list[float]] = {}
     for words in [*given, *known.axis]:
         require(len(words) > 1, f"an axis needs a name and values, not {words}")
@@ -229,11 +231,18 @@ def _sweep(arguments: Sequence[str]) -> None:
     # Processes join before JAX looks for its devices, as making a scenario does.
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--coordinator")
-    first.add_argument("--processes", type=int)
-    first.add_argument("--process", type=int)
+    first.add_argument("--processes")
+    first.add_argument("--process")
     known, _ = first.parse_known_args(others)
+    numbers = known.processes, known.process
+    for number in numbers:
+        require(
+            number is None or (number.isdecimal() and bool(known.coordinator)),
+            "--processes and --process are whole numbers, and need --coordinator",
+        )
     if known.coordinator:
-        population.join(known.coordinator, known.processes, known.process)
+        processes, process = (n if n is None else int(n) for n in numbers)
+        population.join(known.coordinator, processes, process)
     scenario, asked = _with_settings(Sweep, "sweep", others)
     folder = sweeping.sweep(
         asked.settings,
@@ -246,8 +255,11 @@ def _sweep(arguments: Sequence[str]) -> None:
         resume=asked.resume,
     )
     if jax.process_index() == 0:
-        written = sweepreport.write_sweep_report(folder)
-        print(written.title, *written.notes, *written.paths, sep="\n")
+        _show(sweepreport.write_sweep_report(folder))
+
+
+def _show(written: sweepreport.SweepReport) -> None:
+    print(written.title, *written.notes, *written.paths, sep="\n")
 
 
 def _evaluate(arguments: Sequence[str]) -> None:
@@ -269,6 +281,10 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
 def _report(arguments: Sequence[str]) -> None:
     asked = parse(Report, "report", arguments)
+    if runfolder.kind(asked.runs[0]) == "sweep":
+        require(len(asked.runs) == 1, "a sweep is reported on alone")
+        _show(sweepreport.write_sweep_report(asked.runs[0], asked.out))
+        return
     print(report.to_terminal(report.write_report(asked.runs, asked.out)), end="")
 
 

@@ -6,6 +6,7 @@ is made to its last use. XLA needs less where it fuses operations, and more wher
 copies.
 """
 
+import functools
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -16,15 +17,14 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
 
-from rewire_jax import training
+from rewire_jax import noise, training
 from rewire_jax.config import require
 from rewire_jax.methods import find_method
 from rewire_jax.plan import Plan
 
 # Of a device's memory; the rest is for compiled code and what others hold.
 _SHARE = 0.8
-# Beyond these the results of one operation have left a CPU's caches before the next
-# one reads them: at 32, each member takes a quarter longer than alone.
+# With more a CPU's caches are too small, and each takes longer.
 _SIDE_BY_SIDE = 8
 
 
@@ -104,10 +104,20 @@ def need(plan: Plan) -> Need:
         chosen = one(jax.eval_shape(program.candidates, plan.members, fresh, 0))
         share = size(chosen.policies) // chosen.valid.size
         work.append(plan.rows * (share + episode * settings.selection_episodes))
+    environments = size(mine.collection) - size(mine.collection.buffer)
+    if settings.sac.noise_color:
+        draw = functools.partial(
+            noise.colored,
+            color=settings.sac.noise_color,
+            length=environment.episode_length,
+            shape=(settings.envs, environment.action_size),
+        )
+        environments += size(jax.eval_shape(draw, member.keys))
+        work.append(peak(draw, member.keys))
     return Need(
         learner=learner,
         buffer=size(mine.collection.buffer),
-        environments=size(mine.collection) - size(mine.collection.buffer),
+        environments=environments,
         work=max(work),
         evaluation=size(policies) + episode * settings.tasks * settings.eval_episodes,
     )

@@ -101,6 +101,14 @@ def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
     return header
 
 
+def kind(folder: Path) -> str:
+    """What a folder holds: "run", also where that cannot be told, or "sweep"."""
+    try:
+        return json.loads((folder / HEADER).read_text()).get("kind", "run")
+    except (OSError, ValueError, AttributeError):
+        return "run"
+
+
 def compare(folder: Path, settings: config.Settings, kind: str = "run") -> None:
     """Raises `UserError` if a folder's run or sweep has other settings."""
 

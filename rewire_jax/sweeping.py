@@ -10,16 +10,15 @@ one begins; so the worst can be left out of the next (successive halving, Jamies
 Talwalkar 2016).
 """
 
-import contextlib
 import functools
 import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +38,6 @@ from rewire_jax.scenarios import Scenario, make_scenario
 from rewire_jax.standing import Standing
 from rewire_jax.sweepdata import read_sweep
 
-_BATCHES = "batches.json"
 _POLL = 1.0  # seconds
 
 
@@ -71,17 +69,23 @@ class Sweep:
         Raises:
           Stopped: interrupted; what is finished is saved.
         """
-        for stage in range(self.settings.tasks):
-            batches, places = self.batches(stage)
-            own = range(jax.process_index(), len(batches), jax.process_count())
-            for number in own:
-                self.train(stage, number, batches, places)
-            # Also at the end: the process that coordinates must outlive the others.
-            _wait(functools.partial(self.finished, stage, len(batches)))
+        try:
+            for stage in range(self.settings.tasks):
+                batches, places = self.batches(stage)
+                own = range(jax.process_index(), len(batches), jax.process_count())
+                for number in own:
+                    self.train(stage, number, batches, places)
+                # Also at the end: who coordinates must outlive the others.
+                _wait(functools.partial(self.finished, stage, len(batches)))
+        except (Stopped, KeyboardInterrupt):
+            raise Stopped(
+                "stopped; what was trained is saved: give the same command with "
+                f"--resume, for {self.folder}"
+            ) from None
 
     def batches(self, stage: int) -> tuple[list[list[int]], int]:
         """Numbers of the members trained on a task, batch by batch, and the places."""
-        path = self.folder / f"task-{stage:03d}" / _BATCHES
+        path = _batches(self.folder, stage)
         if jax.process_index() == 0 and not path.exists():
             numbers = self.survivors(stage)
             size, count = self.share(len(numbers))
@@ -109,11 +113,13 @@ class Sweep:
 
     def share(self, members: int) -> tuple[int, int]:
         """Places in a batch and how many batches, for so many members."""
-        count = math.ceil(members / self.most)
+        devices = jax.local_device_count()
+        # In whole rounds of the devices, as places are.
+        most = max(self.most - self.most % devices, min(self.most, devices))
+        count = math.ceil(members / most)
         if members >= jax.process_count():
             count = jax.process_count() * math.ceil(count / jax.process_count())
         size = math.ceil(members / count)
-        devices = jax.local_device_count()
         if size > devices:
             size = devices * math.ceil(size / devices)
         return size, math.ceil(members / size)
@@ -125,7 +131,7 @@ class Sweep:
 
     def batch(self, stage: int, number: int) -> Path:
         """A batch's folder."""
-        return self.folder / f"task-{stage:03d}" / f"batch-{number:03d}"
+        return _batches(self.folder, stage).with_name(f"batch-{number:03d}")
 
     def plan(self, numbers: Sequence[int], places: int) -> Plan:
         """The plan of a batch."""
@@ -147,11 +153,16 @@ class Sweep:
         names = [member.name for member in plan.crowd]
         with self.progress(plan.names, plan.interactions, names, label) as display:
             run = Run(plan, folder, display, choosing=True)
-            with interruptible(run), self.interrupted():
+
+            def start() -> Standing:
                 now = standing.restore(folder, plan, display.message)
-                if now is None:
-                    now = self.gather(stage, plan) if stage else run.start()
-                run.task(now, self.ahead(stage, number, len(batches)))
+                return now or (self.gather(stage, plan) if stage else run.start())
+
+            with interruptible(run):
+                # Where it stands is not kept here: what was learned before would be.
+                run.task(start(), self.ahead(stage, number, len(batches)))
+            if run.stopping:  # since the last chunk
+                raise Stopped
 
     def ahead(self, stage: int, number: int, batches: int) -> int:
         """Batches that this process is still to train after one."""
@@ -182,16 +193,6 @@ class Sweep:
         rows += rows[:1] * (plan.places - len(rows))
         items = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
         return standing.between(stage, items, plan)
-
-    @contextlib.contextmanager
-    def interrupted(self) -> Iterator[None]:
-        """Says how to go on with the whole sweep."""
-        try:
-            yield
-        except Stopped:
-            raise Stopped(
-                f"stopped and saved: continue with --resume --out {self.folder}"
-            ) from None
 
 
 def sweep(
@@ -238,10 +239,10 @@ def sweep(
     require(members_per_batch >= 0, "--members-per-batch must be at least 0")
     require(random >= 0, f"--random must be at least 0, not {random}")
     config.validate(settings)
+    given = {name: [float(x) for x in values] for name, values in (axes or {}).items()}
     if not configurations:
-        require(bool(axes), "a sweep needs an axis, such as --alpha 0 1e-5")
-        assert axes is not None
-        configurations = draws(axes, random, settings) if random else grid(axes)
+        require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
+        configurations = draws(given, random, settings) if random else grid(given)
     settings, crowd = _crowd(settings, configurations)
     scenario = scenario or make_scenario(settings.scenario, settings.backend)
     plan = prepare(settings, scenario, crowd[:1])
@@ -257,7 +258,7 @@ def sweep(
     header = {
         "kind": "sweep",
         "settings": config.to_json(plan.settings),
-        "axes": axes or _values(members),
+        "axes": given or _values(members),
         "random": random,
         "halving": halving,
         "members": members,
@@ -278,20 +279,18 @@ def sweep(
         "or name another --out",
     )
     need = memory.need(plan)
-    most = members_per_batch or memory.fitting(need, jax.local_devices())
-    print(
-        f"{need}; {min(most, len(crowd))} of {len(crowd)} members side by side",
-        file=sys.stderr,
-    )
-    Sweep(
+    made = Sweep(
         folder=folder,
         settings=plan.settings,
         scenario=scenario,
         crowd=crowd,
         halving=halving,
-        most=most,
+        most=members_per_batch or memory.fitting(need, jax.local_devices()),
         progress=progress,
-    ).run()
+    )
+    size, _ = made.share(len(crowd))
+    print(f"{need}; {len(crowd)} members, {size} at a time", file=sys.stderr)
+    made.run()
     return folder
 
 
@@ -299,9 +298,11 @@ def _crowd(
     settings: Settings, configurations: Sequence[Mapping[str, float]]
 ) -> tuple[Settings, tuple[Member, ...]]:
     """The settings that a population shares, and its members."""
-    same = {tuple(values) for values in configurations}
+    same = {frozenset(values) for values in configurations}
     require(len(same) == 1, "all configurations need values for the same settings")
     variants = [configure(settings, values) for values in configurations]
+    twice = len(variants) - len({(v.sac, v.options) for v in variants})
+    require(not twice, f"{twice} of the configurations are the same as others")
     together = find_method(settings.method).together([v.options for v in variants])
     pairs = [(v.sac, options) for v, options in zip(variants, together, strict=True)]
     seeds = range(settings.seed, settings.seed + settings.seeds)
@@ -310,6 +311,37 @@ def _crowd(
         for member in population.cross(pairs, seeds)
     )
     return replace(variants[0], options=together[0]), crowd
+
+
+class Found(NamedTuple):
+    """Where a member's policies are: a batch's folder, and its place among so many."""
+
+    folder: Path
+    stage: int
+    place: int
+    places: int
+
+
+def find(folder: Path, member: int, stage: int | None) -> Found:
+    """Where a member is after a stage, or after the latest one.
+
+    Raises:
+      UserError: it has not been trained so far.
+    """
+    stages = sorted(int(path.name[-3:]) for path in folder.glob("task-*"))
+    for each in reversed(stages) if stage is None else [stage]:
+        path = _batches(folder, each)
+        read = json.loads(path.read_text()) if path.exists() else {"batches": []}
+        for number, batch in enumerate(read["batches"]):
+            inside = path.with_name(f"batch-{number:03d}")
+            if member in batch and standing.finished(inside, each):
+                return Found(inside, each, batch.index(member), read["size"])
+    when = "any task" if stage is None else f"task {stage}"
+    raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
+
+
+def _batches(folder: Path, stage: int) -> Path:
+    return folder / f"task-{stage:03d}" / "batches.json"
 
 
 def _values(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:

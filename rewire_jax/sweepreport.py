@@ -119,12 +119,16 @@ def _notes(summary: SweepSummary) -> Iterator[str]:
         yield (
             f"Best: {settings_text(best.values)}; performance after "
             f"{_tasks(best.stage)} {tables.interval(best.interval)}, "
-            + ("of one seed." if count == 1 else f"95% interval of {count} seeds.")
+            + (
+                "of one seed, which tells settings apart by chance."
+                if count == 1
+                else f"95% interval of {count} seeds."
+            )
         )
         found = len(summary.contenders)
         if found:
             yield (
-                f"Others whose interval reaches its mean: {found}. This sweep does not "
+                f"Others whose interval reaches its own: {found}. This sweep does not "
                 "tell these apart."
             )
     if not sweep.complete:

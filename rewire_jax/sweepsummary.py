@@ -79,17 +79,17 @@ class SweepSummary:
 
     @property
     def contenders(self) -> list[Configuration]:
-        """Those that came as far as the best and whose interval reaches its mean."""
+        """Those that came as far as the best and whose interval reaches its own."""
         best = self.best
         return [
             other
             for other in self.configurations
             if best is not None
-            and best.performance.mean is not None
+            and best.interval.low is not None
             and other is not best
             and other.stage == best.stage
             and other.interval.high is not None
-            and other.interval.high >= best.performance.mean
+            and other.interval.high >= best.interval.low
         ]
 
 

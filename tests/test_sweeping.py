@@ -110,7 +110,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert "24 configurations" in done.stdout
     # Known before anything is compiled, and so said first.
     first, *later = done.stderr.splitlines()
-    assert re.match(r"a member needs .* MB: learner .*; 12 of 24 members side", first)
+    assert re.match(r"a member needs .* MB: learner .*; 24 members, 12 at a t", first)
     assert all("finished in" in line for line in later)
     for name in ("members.csv", "configurations.csv", "sweep.md", "panels.png"):
         assert str(folder / name) in done.stdout
@@ -162,6 +162,13 @@ def alone(numbers: range, swept: Path, tmp_path: Path) -> None:
                 for place, row in wanted.items()
             }
             near(ours, wanted)
+        observation = jnp.linspace(-1, 1, 20).reshape(10, 2)
+        for stage, task in ((0, 0), (None, 1)):
+            one = rewire_jax.load_policy(folder, task=task, stage=stage)
+            among = rewire_jax.load_policy(swept, task=task, stage=stage, member=number)
+            np.testing.assert_allclose(
+                one(observation), among(observation), rtol=1e-3, atol=1e-3
+            )
 
 
 def test_a_member_is_what_it_is_alone(swept: Path, tmp_path: Path) -> None:
@@ -336,9 +343,10 @@ def test_settings_that_make_no_sense_are_said(tmp_path: Path) -> None:
         ({"axes": {"beta": [1]}, "halving": 0}, "--halving"),
         ({"axes": {"beta": [1]}, "random": -1}, "--random"),
         ({"axes": {"beta": [1]}, "members_per_batch": -1}, "--members-per-batch"),
-        ({"axes": {"beta": [1, 2]}, "random": 2} | {"axes": {"beta": [1]}}, "a range"),
+        ({"axes": {"beta": [1]}, "random": 2}, "1 of the configurations are the same"),
         ({"configurations": [{"beta": 1}, {"alpha": 1}]}, "the same settings"),
         ({"axes": {"hidden": [1]}}, "no sweep over 'hidden'"),
+        ({"axes": {"beta": np.array([1, 1])}}, "1 of the configurations are the same"),
     ):
         with pytest.raises(UserError, match=said):
             sweep(tmp_path / "none", small(), **options)
@@ -365,8 +373,62 @@ def test_another_sweep_or_a_run_is_not_resumed(
         (["--resume", "--axis", "tau", "1", "2"], "other axes"),
     ):
         fails([*command(swept)[3:], *more], said, capsys)
+    for wrong, said in (
+        ({"task": 0}, "give member"),
+        ({"task": 0, "member": 24}, "no member 24"),
+        ({"task": 2, "member": 0}, "tasks 0 to 1"),
+        ({"task": 0, "member": 0, "stage": 2}, "not been trained on task 2"),
+    ):
+        with pytest.raises(UserError, match=said):
+            rewire_jax.load_policy(swept, **wrong)
     with pytest.raises(UserError, match="holds a sweep, not a run"):
-        rewire_jax.load_policy(swept, task=0)
+        rewire_jax.evaluate(swept)
+
+
+def test_report_takes_a_sweep(swept: Path, tmp_path: Path) -> None:
+    cli.main(["report", str(swept), "--out", str(tmp_path)])
+    for name in ("members.csv", "configurations.csv", "panels.png"):
+        assert (tmp_path / name).read_bytes() == (swept / name).read_bytes()
+
+
+def test_random_and_halved_from_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # K is kept; of four configurations two and one go on.
+    words = command(tmp_path / "sweep")[3:]
+    words = [*words[: words.index("--k")], "--k", "1", "--beta", "0.1", "10"]
+    cli.main([*words, "--random", "4", "--halving", "2"])
+    assert "4 configurations" in capsys.readouterr().out
+    header = json.loads((tmp_path / "sweep/settings.json").read_text())
+    values = [member["values"] for member in header["members"]]
+    assert {value["modes"] for value in values} == {1}
+    assert len({value["beta"] for value in values}) == 4
+    found = rows(tmp_path / "sweep")
+    assert len({place[1] for place in found if place[0] == 0}) == 4
+    assert len({place[1] for place in found if place[0] == 1}) == 2
+
+
+@pytest.mark.parametrize("name", ["chunk", "evaluate"])
+def test_a_sweep_stops_when_asked_to(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called = getattr(continual.Run, name)
+
+    def interrupted(self, *rest):
+        os.kill(os.getpid(), signal.SIGINT)
+        return called(self, *rest)
+
+    options = {"axes": {"beta": [1, 2, 3, 4, 5, 6, 7]}, "members_per_batch": 4}
+    settings = dataclasses.replace(
+        small(), sac=dataclasses.replace(small().sac, hidden=15)
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(continual.Run, name, interrupted)
+        with pytest.raises(continual.Stopped, match="same command with --resume"):
+            sweep(tmp_path / "sweep", settings, **options)
+    assert not (tmp_path / "sweep/task-000/batch-001").exists()
+    sweep(tmp_path / "sweep", settings, **options, resume=True)
+    assert len(rows(tmp_path / "sweep")) == 3 * 7 * 2
 
 
 @pytest.mark.parametrize(
@@ -376,6 +438,12 @@ def test_another_sweep_or_a_run_is_not_resumed(
         (["--axis", "beta", "1", "--beta", "2"], "beta is an axis twice"),
         (["--axis", "beta", "one"], "could not convert"),
         (["--k", "1.5"], "--modes must be a whole number"),
+        (["--k", "inf"], "--modes must be finite"),
+        (["--random", "2", "--beta", "1", "nan"], "--beta must be finite"),
+        (["--random", "2", "--k", "1.5", "4"], "--modes must be a whole number"),
+        (["--beta", "1", "--beta", "2"], "beta is an axis twice"),
+        (["--beta", "1", "--process", "1"], "need --coordinator"),
+        (["--beta", "1", "--processes", "two"], "are whole numbers"),
         (["--axis", "tau", "0"], "--tau must be above 0"),
         (["--random", "3", "--beta", "1", "2", "3"], "needs a range"),
         (["--method", "ft1", "--alpha", "1"], "no sweep over 'alpha'"),

@@ -216,7 +216,7 @@ def test_unfinished_sweep_is_compared_where_all_have_come(tmp_path):
 
 
 def test_what_the_sweep_does_not_tell_apart(tmp_path):
-    # Seeds are 10 apart: the first's interval holds the second's mean.
+    # Seeds are 10 apart: the first's interval overlaps the second's.
     line = [{"modes": k, "alpha": 0.0, "beta": 0.0} for k in (1, 2)]
 
     def near(member, stage, task):
@@ -226,14 +226,14 @@ def test_what_the_sweep_does_not_tell_apart(tmp_path):
         write_sweep(tmp_path / "near", configurations=line, score=near, choice=near)
     )
     assert [each.index for each in report.summary.contenders] == [0]
-    assert "interval reaches its mean: 1." in report.markdown.read_text()
+    assert "interval reaches its own: 1." in report.markdown.read_text()
     far = write_sweep(tmp_path / "far", configurations=line)
     assert write_sweep_report(far).summary.contenders == []
 
 
 def test_single_seed_has_no_interval(tmp_path):
     report = write_sweep_report(write_sweep(tmp_path / "sweep", seeds=1))
-    assert "after 3 tasks 330, of one seed." in report.notes[0]
+    assert "after 3 tasks 330, of one seed, which" in report.notes[0]
     assert "standard deviation;" not in report.markdown.read_text().split("![")[1]
     assert rows(report.configurations)[0]["performance_low"] == ""
     assert "12 configurations × 1 seed," in report.title
