@@ -281,7 +281,7 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
 def _report(arguments: Sequence[str]) -> None:
     asked = parse(Report, "report", arguments)
-    if runfolder.kind(asked.runs[0]) == "sweep":
+    if "sweep" in map(runfolder.kind, asked.runs):
         require(len(asked.runs) == 1, "a sweep is reported on alone")
         _show(sweepreport.write_sweep_report(asked.runs[0], asked.out))
         return
