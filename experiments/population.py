@@ -93,7 +93,7 @@ def measure(job: Population, members: int) -> dict[str, Any]:
     wall, processor = (min(times) / taken for times in zip(*rounds, strict=True))
     return {
         "members": members,
-        "side_by_side": memory.fitting(memory.need(plan), jax.local_devices()),
+        "side_by_side": memory.fitting(need, jax.local_devices()),
         "compile_seconds": compiling[0],
         "compile_processor_seconds": compiling[1],
         "seconds": wall,

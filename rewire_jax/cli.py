@@ -162,24 +162,31 @@ def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) ->
         raise UserError(" ".join(" ".join(said).split())) from None
 
 
+def _peek(arguments: Sequence[str], **defaults: str | None) -> list[Any]:
+    """Values of flags that must be known before the rest is read."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name, default in defaults.items():
+        parser.add_argument(f"--{name}", default=default)
+    known, _ = parser.parse_known_args(arguments)
+    return [getattr(known, name) for name in defaults]
+
+
 def _with_settings(
     kind: Callable[..., T], name: str, arguments: Sequence[str]
 ) -> tuple[Scenario, T]:
     """Reads arguments that begin with a scenario and hold settings of a run."""
-    # The settings' defaults depend on these four, so they are read before the rest.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--method", default="rewire")
-    first.add_argument("--profile", default="paper")
-    first.add_argument("--backend", default="positional")
-    known, _ = first.parse_known_args(arguments)
+    # The settings' defaults depend on these, so they are read before the rest.
+    method, profile, backend = _peek(
+        arguments, method="rewire", profile="paper", backend="positional"
+    )
     given = bool(arguments) and not arguments[0].startswith("-")
     require(
         given or "--help" in arguments or "-h" in arguments,
         f"{name} needs a scenario: see `rewire-jax list`",
     )
     which = arguments[0] if given else "halfcheetah/forgetting"
-    scenario = make_scenario(which, known.backend)
-    default = preset(scenario, known.method, known.profile)
+    scenario = make_scenario(which, backend)
+    default = preset(scenario, method, profile)
     return (
         scenario,
         parse(
@@ -229,20 +236,17 @@ def _axes(arguments: Sequence[str]) -> tuple[dict[str, list[float]], list[str]]:
 def _sweep(arguments: Sequence[str]) -> None:
     axes, others = _axes(arguments)
     # Processes join before JAX looks for its devices, as making a scenario does.
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--coordinator")
-    first.add_argument("--processes")
-    first.add_argument("--process")
-    known, _ = first.parse_known_args(others)
-    numbers = known.processes, known.process
+    coordinator, *numbers = _peek(
+        others, coordinator=None, processes=None, process=None
+    )
     for number in numbers:
         require(
-            number is None or (number.isdecimal() and bool(known.coordinator)),
+            number is None or (number.isdecimal() and bool(coordinator)),
             "--processes and --process are whole numbers, and need --coordinator",
         )
-    if known.coordinator:
+    if coordinator:
         processes, process = (n if n is None else int(n) for n in numbers)
-        population.join(known.coordinator, processes, process)
+        population.join(coordinator, processes, process)
     scenario, asked = _with_settings(Sweep, "sweep", others)
     folder = sweeping.sweep(
         asked.settings,

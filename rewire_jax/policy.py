@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from rewire_jax.axes import configure
 from rewire_jax.errors import UserError
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Spec
+from rewire_jax.sweeping import Found
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
 """`[..., observations]` -> actions `[..., actions]` in [-1, 1]."""
@@ -43,75 +44,46 @@ def load_policy(
       UserError: no such run, task, seed, member or stage, or a damaged checkpoint.
     """
     folder = Path(run)
-    if runfolder.kind(folder) == "sweep":
-        source = _of_sweep(folder, seed, stage, member)
+    kind = runfolder.kind(folder)
+    header = runfolder.read_header(folder, kind)
+    entry = find_method(header["settings"]["method"])
+    settings = config.from_json(header["settings"], entry.settings)
+    spec = Spec(**header["spec"])
+    if not 0 <= task < spec.tasks:
+        raise UserError(f"{folder} has tasks 0 to {spec.tasks - 1}, not {task}")
+    if kind == "sweep":
+        if member is None or seed is not None:
+            raise UserError(
+                f"{folder} holds a sweep: give member, a number in members.csv"
+            )
+        if not 0 <= member < len(header["members"]):
+            raise UserError(f"{folder} has no member {member}: see members.csv there")
+        found = sweeping.find(folder, member, stage)
+        settings = configure(settings, header["members"][member]["values"])
     else:
-        source = _of_run(folder, seed, stage, member)
-    tasks = source.spec.tasks
-    if not 0 <= task < tasks:
-        raise UserError(f"{folder} has tasks 0 to {tasks - 1}, not {task}")
-    keys = jax.vmap(jax.random.key)(jnp.arange(source.places))
-    like = {"policy": jax.eval_shape(jax.vmap(source.method.init), keys)}
-    items, _ = checkpoint.load(source.path, like)
+        if member is not None:
+            raise UserError(f"{folder} holds a run: give seed, not member")
+        seed = settings.seed if seed is None else seed
+        found = Found(folder, stage, seed - settings.seed, settings.seeds)
+        if not 0 <= found.place < found.places:
+            raise UserError(
+                f"{folder} has no seed {seed}: see {runfolder.HEADER} there"
+            )
+    method = entry.make(spec, settings.options)
     params, memory = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf[source.place]), items["policy"]
+        lambda leaf: jnp.asarray(leaf[found.place]), _load(found, method)
     )
-    policy = source.method.policy(params, memory, jnp.asarray(task))
+    policy = method.policy(params, memory, jnp.asarray(task))
 
     def act(observation: jax.Array) -> jax.Array:
-        mean, _ = source.method.act(policy, observation)
+        mean, _ = method.act(policy, observation)
         return jnp.tanh(mean)
 
     return act
 
 
-class _Source(NamedTuple):
-    """Where a member's policies are: its method, a checkpoint and its place there."""
-
-    method: Method
-    spec: Spec
-    path: Path
-    place: int
-    places: int
-
-
-def _of_run(
-    folder: Path, seed: int | None, stage: int | None, member: int | None
-) -> _Source:
-    header = runfolder.read_header(folder)
-    entry = find_method(header["settings"]["method"])
-    settings = config.from_json(header["settings"], entry.settings)
-    seed = settings.seed if seed is None else seed
-    place = seed - settings.seed if member is None else member
-    if not 0 <= place < settings.seeds:
-        raise UserError(f"{folder} has no seed {seed}: see {runfolder.HEADER} there")
-    spec = Spec(**header["spec"])
-    return _Source(
-        method=entry.make(spec, settings.options),
-        spec=spec,
-        path=standing.kept(folder, stage),
-        place=place,
-        places=settings.seeds,
-    )
-
-
-def _of_sweep(
-    folder: Path, seed: int | None, stage: int | None, member: int | None
-) -> _Source:
-    header = runfolder.read_header(folder, "sweep")
-    if member is None or seed is not None:
-        raise UserError(f"{folder} holds a sweep: give member, a number in members.csv")
-    if not 0 <= member < len(header["members"]):
-        raise UserError(f"{folder} has no member {member}: see members.csv there")
-    entry = find_method(header["settings"]["method"])
-    shared = config.from_json(header["settings"], entry.settings)
-    values = header["members"][member]["values"]
-    spec = Spec(**header["spec"])
-    found = sweeping.find(folder, member, stage)
-    return _Source(
-        method=entry.make(spec, configure(shared, values).options),
-        spec=spec,
-        path=standing.kept(found.folder, found.stage),
-        place=found.place,
-        places=found.places,
-    )
+def _load(found: Found, method: Method) -> Any:
+    keys = jax.vmap(jax.random.key)(jnp.arange(found.places))
+    like = {"policy": jax.eval_shape(jax.vmap(method.init), keys)}
+    path = standing.kept(found.folder, found.stage)
+    return checkpoint.load(path, like)[0]["policy"]

@@ -119,10 +119,10 @@ def read_sweep(folder: str | Path) -> SweepData:
         key = index(row, "member", 0, count), stage, task
         return key, values | {"choice": number(row["choice"])}
 
-    for now, batch, members in _batches(folder, count, tasks):
+    for now, place, members in _batches(folder, count, tasks):
         trained[members, now] = True
-        hours += times(batch / "timing.jsonl", tasks, len(members), False)[0]
-        rows = table(batch / "results.jsonl", parse, needed=False)
+        hours += times(place / "timing.jsonl", tasks, len(members), False)[0]
+        rows = table(place / "results.jsonl", parse, needed=False)
         for (member, stage, task), row in rows.items():
             if stage < 0:  # before any training
                 continue
@@ -178,13 +178,22 @@ def _design(path: Path, head: Head) -> tuple[int, int, dict[str, Array], Whole, 
     return drawn, halving, axes, configurations, seeds
 
 
+def batches_of(folder: Path, stage: int) -> Path:
+    """The file that says which members are trained on a task side by side."""
+    return folder / f"task-{stage:03d}" / "batches.json"
+
+
+def batch(folder: Path, stage: int, number: int) -> Path:
+    """The folder of a batch."""
+    return batches_of(folder, stage).with_name(f"batch-{number:03d}")
+
+
 def _batches(
     folder: Path, count: int, tasks: int
 ) -> Iterator[tuple[int, Path, list[int]]]:
     """Stage, folder and members of each batch of the stages that have begun."""
     for stage in range(tasks):
-        place = folder / f"task-{stage:03d}"
-        path = place / "batches.json"
+        path = batches_of(folder, stage)
         if not path.exists():
             return
         try:
@@ -194,5 +203,5 @@ def _batches(
                 raise ValueError(f"members are 0 to {count - 1}")
         except (ValueError, TypeError, KeyError) as error:
             raise UserError(f"{path} is damaged ({reason(error)})") from None
-        for batch, members in enumerate(batches):
-            yield stage, place / f"batch-{batch:03d}", members
+        for place, members in enumerate(batches):
+            yield stage, batch(folder, stage, place), members

@@ -36,7 +36,7 @@ from rewire_jax.progress import Progress
 from rewire_jax.ranking import rank
 from rewire_jax.scenarios import Scenario, make_scenario
 from rewire_jax.standing import Standing
-from rewire_jax.sweepdata import read_sweep
+from rewire_jax.sweepdata import batch, batches_of, read_sweep
 
 _POLL = 1.0  # seconds
 
@@ -85,7 +85,7 @@ class Sweep:
 
     def batches(self, stage: int) -> tuple[list[list[int]], int]:
         """Numbers of the members trained on a task, batch by batch, and the places."""
-        path = _batches(self.folder, stage)
+        path = batches_of(self.folder, stage)
         if jax.process_index() == 0 and not path.exists():
             numbers = self.survivors(stage)
             size, count = self.share(len(numbers))
@@ -126,12 +126,8 @@ class Sweep:
 
     def finished(self, stage: int, batches: int) -> bool:
         """Whether all of a task's batches are."""
-        folders = (self.batch(stage, number) for number in range(batches))
+        folders = (batch(self.folder, stage, number) for number in range(batches))
         return all(standing.finished(folder, stage) for folder in folders)
-
-    def batch(self, stage: int, number: int) -> Path:
-        """A batch's folder."""
-        return _batches(self.folder, stage).with_name(f"batch-{number:03d}")
 
     def plan(self, numbers: Sequence[int], places: int) -> Plan:
         """The plan of a batch."""
@@ -142,7 +138,7 @@ class Sweep:
         self, stage: int, number: int, batches: list[list[int]], places: int
     ) -> None:
         """Trains a batch on a task, or what is left of that."""
-        folder = self.batch(stage, number)
+        folder = batch(self.folder, stage, number)
         if standing.finished(folder, stage):
             return
         plan = self.plan(batches[number], places)
@@ -177,17 +173,18 @@ class Sweep:
         found: dict[int, Any] = {}
         wanted = {member.number for member in plan.crowd}
         batches, places = self.batches(stage - 1)
-        for number, batch in enumerate(batches):
-            if wanted.isdisjoint(batch):
+        for number, numbers in enumerate(batches):
+            if wanted.isdisjoint(numbers):
                 continue
-            folder = self.batch(stage - 1, number)
+            folder = batch(self.folder, stage - 1, number)
             try:
-                items = standing.read_kept(folder, stage - 1, self.plan(batch, places))
+                made = self.plan(numbers, places)
+                items = standing.read_kept(folder, stage - 1, made)
             except checkpoint.CheckpointError as error:
                 raise UserError(
                     f"{error}; or delete {folder} and resume to train it anew"
                 ) from error
-            for place, name in enumerate(batch):
+            for place, name in enumerate(numbers):
                 found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
         rows = [found[member.number] for member in plan.crowd]
         rows += rows[:1] * (plan.places - len(rows))
@@ -314,10 +311,10 @@ def _crowd(
 
 
 class Found(NamedTuple):
-    """Where a member's policies are: a batch's folder, and its place among so many."""
+    """Where a member's policies are: folder, stage, and its place among so many."""
 
     folder: Path
-    stage: int
+    stage: int | None
     place: int
     places: int
 
@@ -330,18 +327,14 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
     """
     stages = sorted(int(path.name[-3:]) for path in folder.glob("task-*"))
     for each in reversed(stages) if stage is None else [stage]:
-        path = _batches(folder, each)
+        path = batches_of(folder, each)
         read = json.loads(path.read_text()) if path.exists() else {"batches": []}
-        for number, batch in enumerate(read["batches"]):
-            inside = path.with_name(f"batch-{number:03d}")
-            if member in batch and standing.finished(inside, each):
-                return Found(inside, each, batch.index(member), read["size"])
+        for number, members in enumerate(read["batches"]):
+            inside = batch(folder, each, number)
+            if member in members and standing.finished(inside, each):
+                return Found(inside, each, members.index(member), read["size"])
     when = "any task" if stage is None else f"task {stage}"
     raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
-
-
-def _batches(folder: Path, stage: int) -> Path:
-    return folder / f"task-{stage:03d}" / "batches.json"
 
 
 def _values(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:

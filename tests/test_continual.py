@@ -21,30 +21,13 @@ from rewire_jax.errors import UserError
 from rewire_jax.program import rollout_function
 from rewire_jax.report import write_report
 from rewire_jax.scenarios import ScenarioSpec, make_scenario
-from tests.tiny import tiny
+from tests.tiny import flags, tiny
 
 TABLES = ("results.jsonl", "training.jsonl")
 
 
 def arguments(settings: Settings, out: Path) -> list[str]:
-    flags = {
-        name: getattr(settings, name)
-        for name in [
-            "method",
-            "profile",
-            "seeds",
-            "interactions",
-            "envs",
-            "updates",
-            "warmup",
-            "eval_episodes",
-            "selection_episodes",
-            "report_every",
-            "checkpoint_every",
-        ]
-    } | {"hidden": settings.sac.hidden, "batch_size": settings.sac.batch_size}
-    words = [w for n, v in flags.items() for w in ("--" + n.replace("_", "-"), str(v))]
-    return ["train", settings.scenario, "--out", str(out), *words]
+    return ["train", settings.scenario, "--out", str(out), *flags(settings)]
 
 
 def command(words: list[str]) -> list[str]:

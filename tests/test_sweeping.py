@@ -25,24 +25,13 @@ from rewire_jax.methods.regularize import FtL2Settings
 from rewire_jax.methods.rewire import RewireSettings, rewire
 from rewire_jax.networks import Linear
 from rewire_jax.permutation import permute
-from tests.tiny import tiny
+from tests.tiny import flags, tiny
 
 GRID: dict[str, list[float]] = {
     "modes": [1, 2, 3, 4],
     "alpha": [0, 1e-2],
     "beta": [0.1, 1, 10],
 }
-SHARED = (
-    "tasks",
-    "interactions",
-    "envs",
-    "updates",
-    "warmup",
-    "eval_episodes",
-    "selection_episodes",
-    "report_every",
-    "checkpoint_every",
-)
 
 
 def small(**changes) -> Settings:
@@ -65,10 +54,7 @@ def small(**changes) -> Settings:
 def command(out: Path, *more: str, most: int = 12) -> list[str]:
     """A sweep of the grid from the command line, in two batches."""
     words = [sys.executable, "-m", "rewire_jax.cli", "sweep", "probe/reach"]
-    words += ["--profile", "quick", "--out", str(out), "--hidden", "14"]
-    words += ["--batch-size", "16", "--members-per-batch", str(most)]
-    for name in SHARED:
-        words += ["--" + name.replace("_", "-"), str(getattr(small(), name))]
+    words += [*flags(small()), "--out", str(out), "--members-per-batch", str(most)]
     words += ["--k", *map(str, GRID["modes"]), "--alpha", *map(str, GRID["alpha"])]
     return [*words, "--axis", "beta", *map(str, GRID["beta"]), *more]
 

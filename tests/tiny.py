@@ -24,3 +24,24 @@ def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Se
         checkpoint_every=320,
         sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
     )
+
+
+def flags(settings: Settings) -> list[str]:
+    """What gives the `rewire-jax` command these settings, after the scenario."""
+    names = (
+        "method",
+        "profile",
+        "seeds",
+        "tasks",
+        "interactions",
+        "envs",
+        "updates",
+        "warmup",
+        "eval_episodes",
+        "selection_episodes",
+        "report_every",
+        "checkpoint_every",
+    )
+    values = {name: getattr(settings, name) for name in names}
+    values |= {name: getattr(settings.sac, name) for name in ("hidden", "batch_size")}
+    return [w for n, v in values.items() for w in ("--" + n.replace("_", "-"), str(v))]
