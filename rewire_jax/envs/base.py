@@ -30,12 +30,15 @@ class State(NamedTuple):
       observation: `[observations]`, masked.
       reward: `[]`, of the step that led here, 0 after a reset.
       terminal: `[]` bool, the task itself ended here (never a time limit).
+      success: `[]` bool, whether the task counts as solved at this step; `()` in
+        environments that know no success.
     """
 
     inner: Any
     observation: jax.Array
     reward: jax.Array
     terminal: jax.Array
+    success: Any = ()
 
 
 class Environment(NamedTuple):
@@ -47,6 +50,9 @@ class Environment(NamedTuple):
       observation_size: length of an observation.
       action_size: length of an action.
       episode_length: steps after which an episode is cut off.
+      success: whether states tell of success.
+      varied: whether every episode in training starts from a reset of its own. Such
+        an environment must not end an episode itself.
     """
 
     reset: Callable[[Task, jax.Array], State]
@@ -54,6 +60,34 @@ class Environment(NamedTuple):
     observation_size: int
     action_size: int
     episode_length: int
+    success: bool = False
+    varied: bool = False
+
+
+class HostEnvironment(NamedTuple):
+    """An environment that cannot be compiled, and so is stepped on the host.
+
+    Every episode starts from a reset of its own. Steps must be determined by the seed
+    and the actions since, whatever was played before: that is how an episode is taken
+    up again where a checkpoint was made.
+
+    Attributes:
+      make: `() -> gymnasium.Env`; it is pickled, and called in the process that steps
+        the environment. `reset(seed=..., options={"task": index})` begins an episode
+        of the task whose `Task.physics` is `index`; `step` takes float32 actions in
+        [-1, 1] and tells success, if at all, as `info["success"]`. Observations are
+        float32. It does not truncate.
+      observation_size: length of an observation.
+      action_size: length of an action.
+      episode_length: steps after which an episode is cut off.
+      success: whether steps tell of success.
+    """
+
+    make: Callable[[], Any]
+    observation_size: int
+    action_size: int
+    episode_length: int
+    success: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,5 +123,5 @@ class Domain(NamedTuple):
       make_task: `TaskChange -> Task`; raises `UserError` on unknown names.
     """
 
-    environment: Environment
+    environment: Environment | HostEnvironment
     make_task: Callable[[TaskChange], Task]
