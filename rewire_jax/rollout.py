@@ -6,7 +6,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.envs.base import Environment, State, Task
+from rewire_jax.envs.base import Environment, HostEnvironment, State, Task
+
+
+class Success(NamedTuple):
+    """Whether a task is solved, by the two rules in use, or how often it was.
+
+    Attributes:
+      any: at any step of the episode so far (Continual World's rule).
+      last: at the latest step (that of the paper's authors).
+    """
+
+    any: jax.Array
+    last: jax.Array
 
 
 class Episode(NamedTuple):
@@ -14,15 +26,17 @@ class Episode(NamedTuple):
 
     Attributes:
       state: its current state.
-      start: the state every further episode starts from.
+      start: the state that the next episode starts from.
       steps: `[]` int32, of the current episode.
       score: `[]`, return of the current episode so far.
+      success: `Success` of `[]` bool in it; `()` where none is known.
     """
 
     state: State
     start: State
     steps: jax.Array
     score: jax.Array
+    success: Any = ()
 
 
 class Step(NamedTuple):
@@ -35,6 +49,7 @@ class Step(NamedTuple):
       last: `[observations]`, what the step led to.
       following: `[observations]`, the same or a fresh start's.
       score: `[]`, return of the episode so far.
+      success: `Success` of `[]` bool in it; `()` where none is known.
     """
 
     reward: jax.Array
@@ -43,32 +58,58 @@ class Step(NamedTuple):
     last: jax.Array
     following: jax.Array
     score: jax.Array
+    success: Any = ()
 
 
 class Rollout(NamedTuple):
-    """Whole episodes, `[..., episodes]` each: returns and lengths in steps."""
+    """Whole episodes, `[..., episodes]` each.
+
+    Attributes:
+      returns: undiscounted.
+      lengths: in steps.
+      success: `Success` of bools; `()` where none is known.
+    """
 
     returns: jax.Array
     lengths: jax.Array
+    success: Any = ()
+
+
+def no_success(environment: Environment | HostEnvironment, shape: Any = ()) -> Any:
+    """`Success` before an episode's first step; `()` where none is known."""
+    none = jnp.zeros(shape, bool)
+    return Success(none, none) if environment.success else ()
+
+
+def succeed(before: Any, now: Any) -> Any:
+    """`Success` after a step; `()` where none is known.
+
+    Args:
+      before: of the episode, before the step.
+      now: bool, `State.success`.
+    """
+    return Success(before.any | now, now) if before else ()
 
 
 def begin(environment: Environment, task: Task, key: jax.Array) -> Episode:
     """An environment at the start of an episode."""
     state = environment.reset(task, key)
-    return Episode(state, state, jnp.zeros((), jnp.int32), jnp.zeros(()))
+    none = no_success(environment)
+    return Episode(state, state, jnp.zeros((), jnp.int32), jnp.zeros(()), none)
 
 
 def advance(
     environment: Environment, task: Task, episode: Episode, action: jax.Array
 ) -> tuple[Episode, Step]:
-    """Steps one environment; an ended episode returns to its own start.
+    """Steps one environment; an ended episode goes to the stored start.
 
-    Returning to a stored start, as brax's wrapper does, saves a reset in every
-    step; the starts differ between environments and tasks.
+    A stored start, as in brax's wrapper, saves a reset in every step; the starts
+    differ between environments and tasks.
     """
     state = environment.step(task, episode.state, action)
     steps = episode.steps + 1
     score = episode.score + state.reward
+    success = succeed(episode.success, state.success)
     truncated = (steps >= environment.episode_length) & ~state.terminal
     ended = state.terminal | truncated
     after = jax.tree.map(lambda a, b: jnp.where(ended, a, b), episode.start, state)
@@ -77,6 +118,7 @@ def advance(
         start=episode.start,
         steps=jnp.where(ended, 0, steps),
         score=jnp.where(ended, 0.0, score),
+        success=jax.tree.map(lambda x: x & ~ended, success),
     ), Step(
         reward=state.reward,
         terminal=state.terminal,
@@ -84,6 +126,7 @@ def advance(
         last=state.observation,
         following=after.observation,
         score=score,
+        success=success,
     )
 
 
@@ -124,9 +167,15 @@ def episodes(
     def body(carry):
         time, state, alive, result = carry
         state = over(step)(tasks, policies, state)
+        success = jax.tree.map(
+            lambda new, old: jnp.where(alive, new, old),
+            succeed(result.success, state.success),
+            result.success,
+        )
         result = Rollout(
             result.returns + jnp.where(alive, state.reward, 0.0),
             result.lengths + alive,
+            success,
         )
         return time + 1, state, alive & ~state.terminal, result
 
@@ -137,6 +186,7 @@ def episodes(
     split = jax.vmap(jax.vmap(lambda key: jax.random.split(key, count)))(keys)
     state = over(reset)(tasks, policies, split)
     shape = (*keys.shape, count)
-    result = Rollout(jnp.zeros(shape), jnp.zeros(shape, jnp.int32))
+    none = no_success(environment, shape)
+    result = Rollout(jnp.zeros(shape), jnp.zeros(shape, jnp.int32), none)
     carry = (jnp.zeros((), jnp.int32), state, jnp.ones(shape, bool), result)
     return jax.lax.while_loop(unfinished, body, carry)[-1]

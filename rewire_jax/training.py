@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from rewire_jax import networks, noise, replay, rollout, sac
 from rewire_jax.config import SacSettings
-from rewire_jax.envs.base import Environment, Task
-from rewire_jax.methods.base import Method
+from rewire_jax.envs.base import Environment, HostEnvironment, Task
+from rewire_jax.methods.base import Memory, Method, Params
 
 
 class Shape(NamedTuple):
@@ -17,10 +17,11 @@ class Shape(NamedTuple):
 
     Attributes:
       envs: parallel environments of a member.
-      updates: SAC updates after each step of all environments.
+      updates: SAC updates at a time.
       warmup: steps of all environments before the first update.
       random: steps of all environments with uniform actions.
       transitions: steps of all environments that the buffer holds.
+      every: steps of all environments from one time to the next.
     """
 
     envs: int
@@ -28,6 +29,15 @@ class Shape(NamedTuple):
     warmup: int
     random: int
     transitions: int
+    every: int = 1
+
+    def due(self, steps: Any) -> Any:
+        """Whether there are updates after so many steps, an int or `[]`."""
+        return (steps % self.every == 0) & (steps > self.warmup)
+
+    def before(self, steps: Any) -> Any:
+        """Updates made before those that are due after so many steps."""
+        return (steps // self.every - 1 - self.warmup // self.every) * self.updates
 
 
 class Collection(NamedTuple):
@@ -68,6 +78,8 @@ class Report(NamedTuple):
       updates: `[]`, steps with updates.
       metrics: sums over these steps, of each one's last update.
       inspected: the method's own metrics at the end.
+      successes: `rollout.Success` of `[]`, episodes among them that were solved; `()`
+        where none is known.
     """
 
     episodes: jax.Array
@@ -76,6 +88,7 @@ class Report(NamedTuple):
     updates: jax.Array
     metrics: sac.Metrics
     inspected: sac.Metrics
+    successes: Any = ()
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -90,6 +103,70 @@ def all_finite(tree: Any) -> jax.Array:
     return jnp.isfinite(total)
 
 
+def explore(
+    key: jax.Array,
+    acting: tuple[Params, Memory],
+    label: Any,
+    observation: jax.Array,
+    steps: jax.Array,
+    time: jax.Array,
+    method: Method,
+    shape: Shape,
+    sequence: jax.Array | None,
+) -> tuple[jax.Array, Any]:
+    """Exploring actions of all environments of a member.
+
+    Args:
+      key: a random key.
+      acting: the method's parameters and memory.
+      label: the method's, of the step before.
+      observation: `[envs, observations]`.
+      steps: `[envs]` int, of the running episodes.
+      time: `[]` int, steps of all environments made before in the task.
+      method: the method.
+      shape: static sizes.
+      sequence: the coloured noise that `time` lies in, None where noise is white.
+
+    Returns:
+      Actions `[envs, actions]`, and the label that belongs to the step.
+    """
+    params, memory = acting
+    context_key, action_key, random_key, label_key = jax.random.split(key, 4)
+    label = method.label(label_key, memory, label, steps)
+    context = method.context(context_key, memory, "act", label)
+    mean, log_std = method.distribution(params, memory, context, observation)
+    if sequence is None:
+        action, _ = networks.sample_action(action_key, mean, log_std)
+    else:
+        action = jnp.tanh(mean + jnp.exp(log_std) * sequence[time % len(sequence)])
+    if shape.random:
+        uniform = jax.random.uniform(random_key, action.shape, minval=-1.0)
+        action = jnp.where(time < shape.random, uniform, action)
+    return action, label
+
+
+def draw_sequence(
+    key: jax.Array,
+    time: jax.Array,
+    size: tuple[int, ...],
+    length: int,
+    settings: SacSettings,
+) -> jax.Array:
+    """Coloured noise `[length, *size]`, as long as an episode, that a step lies in.
+
+    Args:
+      key: the task's, as in `train`.
+      time: `[]` int, of the step.
+      size: of the noise in a step.
+      length: of an episode.
+      settings: SAC's.
+    """
+    # A key that the steps do not use.
+    start_key = jax.random.fold_in(key, time - time % length)
+    sequence_key = jax.random.split(start_key, 4)[3]
+    return noise.colored(sequence_key, settings.noise_color, length, size)
+
+
 def collect(
     key: jax.Array,
     state: State,
@@ -100,27 +177,45 @@ def collect(
     shape: Shape,
     sequence: jax.Array | None,
 ) -> tuple[Collection, rollout.Step]:
-    """One exploring step of all environments of a member, stored in its buffer.
-
-    `sequence` is the coloured noise that `time` lies in, None where noise is white.
-    """
+    """One exploring step of all environments of a member, stored in its buffer."""
     learner, (buffer, episodes, label), _ = state
-    context_key, action_key, random_key, label_key = jax.random.split(key, 4)
-    label = method.label(label_key, learner.memory, label, episodes.steps)
-    context = method.context(context_key, learner.memory, "act", label)
-    mean, log_std = method.distribution(
-        learner.params, learner.memory, context, episodes.state.observation
+    action, label = explore(
+        key,
+        (learner.params, learner.memory),
+        label,
+        episodes.state.observation,
+        episodes.steps,
+        time,
+        method,
+        shape,
+        sequence,
     )
-    if sequence is None:
-        action, _ = networks.sample_action(action_key, mean, log_std)
-    else:
-        action = jnp.tanh(mean + jnp.exp(log_std) * sequence[time % len(sequence)])
-    if shape.random:
-        uniform = jax.random.uniform(random_key, action.shape, minval=-1.0)
-        action = jnp.where(time < shape.random, uniform, action)
+    length = environment.episode_length
+    if environment.varied:
+        # All episodes end together, and so are reset in a real branch.
+        keys = jax.random.split(jax.random.split(key, 5)[4], shape.envs)
+        starts = jax.lax.cond(
+            (time + 1) % length == 0,
+            lambda: jax.vmap(lambda k: environment.reset(task, k))(keys),
+            lambda: episodes.start,
+        )
+        episodes = episodes._replace(start=starts)
     advance = functools.partial(rollout.advance, environment, task)
     episodes, step = jax.vmap(advance)(episodes, action)
-    buffer = replay.add(
+    buffer = store(buffer, time, action, label, step, length)
+    return Collection(buffer, episodes, label), step
+
+
+def store(
+    buffer: replay.Replay,
+    time: jax.Array,
+    action: jax.Array,
+    label: Any,
+    step: rollout.Step,
+    episode_length: int,
+) -> replay.Replay:
+    """A member's buffer with one more step of all environments."""
+    return replay.add(
         buffer,
         time,
         action=action,
@@ -129,21 +224,19 @@ def collect(
         truncated=step.truncated,
         last=step.last,
         following=step.following,
-        episode_length=environment.episode_length,
+        episode_length=episode_length,
         label=label,
     )
-    return Collection(buffer, episodes, label), step
 
 
 def draw_batch(
     key: jax.Array,
-    state: State,
+    buffer: replay.Replay,
     time: jax.Array,
-    environment: Environment,
+    length: int,
     settings: SacSettings,
 ) -> replay.Batch:
-    """A batch from a member's buffer of `time` steps."""
-    buffer, length = state.collection.buffer, environment.episode_length
+    """A batch from a member's buffer of `time` steps; `length` is an episode's."""
     return replay.sample(buffer, key, time, settings.batch_size, length)
 
 
@@ -154,7 +247,7 @@ def learn(
     first: jax.Array,
     updates: jax.Array | int,
     *,
-    environment: Environment,
+    environment: Environment | HostEnvironment,
     method: Method,
     settings: SacSettings,
 ) -> tuple[State, sac.Metrics]:
@@ -170,9 +263,10 @@ def learn(
       method: the method.
       settings: SAC's.
     """
+    buffer, length = state.collection.buffer, environment.episode_length
 
     def draw(key):
-        return draw_batch(key, state, time, environment, settings)
+        return draw_batch(key, buffer, time, length, settings)
 
     def one(number, carry):
         learner, metrics = carry
@@ -195,6 +289,30 @@ def learn(
     )
     learner = select(alive, learner, state.learner)
     return state._replace(learner=learner, alive=alive), metrics
+
+
+def follow(
+    key: jax.Array,
+    state: State,
+    steps: jax.Array,
+    *,
+    environment: Environment | HostEnvironment,
+    method: Method,
+    settings: SacSettings,
+    shape: Shape,
+) -> tuple[State, sac.Metrics]:
+    """The updates that are due after so many steps of a task, as in `learn`."""
+    updates = jnp.where(shape.due(steps), shape.updates, 0)
+    return learn(
+        key,
+        state,
+        steps,
+        shape.before(steps),
+        updates,
+        environment=environment,
+        method=method,
+        settings=settings,
+    )
 
 
 def train(
@@ -223,54 +341,88 @@ def train(
       settings: SAC's.
       shape: static sizes.
     """
-    update = functools.partial(
-        learn, environment=environment, method=method, settings=settings
-    )
     color, length = settings.noise_color, environment.episode_length
     size = shape.envs, environment.action_size
 
-    def draw_sequence(index):
-        # As long as an episode. A key that the steps do not use.
-        start_key = jax.random.fold_in(key, index - index % length)
-        sequence_key = jax.random.split(start_key, 4)[3]
-        return noise.colored(sequence_key, color, length, size)
+    def update(key, state, done):
+        return follow(
+            key,
+            state,
+            done,
+            environment=environment,
+            method=method,
+            settings=settings,
+            shape=shape,
+        )
 
     def step(index, carry):
         state, report, sequence = carry
         if sequence is not None:
             # It is not part of the state: a chunk draws it anew.
-            due = (index % length == 0) | (index == time)
-            sequence = jax.lax.cond(due, draw_sequence, lambda _: sequence, index)
+            sequence = jax.lax.cond(
+                (index % length == 0) | (index == time),
+                lambda: draw_sequence(key, index, size, length, settings),
+                lambda: sequence,
+            )
         collect_key, update_key = jax.random.split(jax.random.fold_in(key, index))
         collection, stepped = collect(
             collect_key, state, task, index, environment, method, shape, sequence
         )
         state = state._replace(collection=collection)
-        updates = jnp.where(index >= shape.warmup, shape.updates, 0)
-        first = (index - shape.warmup) * shape.updates
-        state, metrics = update(update_key, state, index + 1, first, updates)
+        state, metrics = update(update_key, state, index + 1)
         ended = stepped.terminal | stepped.truncated
         report = Report(
             report.episodes + jnp.sum(ended),
             report.returns + jnp.sum(jnp.where(ended, stepped.score, 0.0)),
             report.rewards + jnp.mean(stepped.reward),
-            report.updates + (updates > 0),
+            report.updates + shape.due(index + 1),
             jax.tree.map(jnp.add, report.metrics, metrics),
             {},
+            jax.tree.map(
+                lambda total, solved: total + jnp.sum(ended & solved),
+                report.successes,
+                stepped.success,
+            ),
         )
         return state, report, sequence
 
-    _, shapes = jax.eval_shape(update, key, state, time, time, 1)
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     none = jnp.zeros(())
-    report = Report(jnp.zeros((), jnp.int32), none, none, none, zeros, {})
+    report = Report(
+        jnp.zeros((), jnp.int32),
+        none,
+        none,
+        none,
+        no_metrics(update, key, state, time),
+        {},
+        rollout.Success(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+        if environment.success
+        else (),
+    )
     end = time + steps
     sequence = jnp.zeros((length, *size)) if color else None
     carry = state, report, sequence
     state, report, _ = jax.lax.fori_loop(time, end, step, carry)
-    # A key that the next step does not use.
-    batch_key = jax.random.split(jax.random.fold_in(key, end), 3)[2]
-    batch = draw_batch(batch_key, state, end, environment, settings)
-    params, memory = state.learner.params, state.learner.memory
-    inspected = method.inspect(params, memory, batch.observation)
+    inspected = inspect(key, state, end, length, method, settings)
     return state, report._replace(inspected=inspected)
+
+
+def no_metrics(update: Any, *arguments: Any) -> sac.Metrics:
+    """Zeros in the shape of the metrics that an update gives beside the state."""
+    _, shapes = jax.eval_shape(update, *arguments)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def inspect(
+    key: jax.Array,
+    state: State,
+    time: jax.Array,
+    length: int,
+    method: Method,
+    settings: SacSettings,
+) -> sac.Metrics:
+    """The method's own metrics after `time` steps; key and length as above."""
+    # A key that the next step does not use.
+    batch_key = jax.random.split(jax.random.fold_in(key, time), 3)[2]
+    buffer, learner = state.collection.buffer, state.learner
+    batch = draw_batch(batch_key, buffer, time, length, settings)
+    return method.inspect(learner.params, learner.memory, batch.observation)
