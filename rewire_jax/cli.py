@@ -121,12 +121,12 @@ class Info:
 
     Attributes:
       scenario: its name.
-      backend: physics backend.
+      backend: physics backend; the domain's first if not given.
       json: print JSON instead of text.
     """
 
     scenario: tyro.conf.Positional[str]
-    backend: str = "positional"
+    backend: str | None = None
     json: bool = False
 
 
@@ -176,8 +176,8 @@ def _with_settings(
 ) -> tuple[Scenario, T]:
     """Reads arguments that begin with a scenario and hold settings of a run."""
     # The settings' defaults depend on these, so they are read before the rest.
-    method, profile, backend = _peek(
-        arguments, method="rewire", profile="paper", backend="positional"
+    method, profile, backend, reward = _peek(
+        arguments, method="rewire", profile="paper", backend=None, reward="v2"
     )
     given = bool(arguments) and not arguments[0].startswith("-")
     require(
@@ -185,7 +185,7 @@ def _with_settings(
         f"{name} needs a scenario: see `rewire-jax list`",
     )
     which = arguments[0] if given else "halfcheetah/forgetting"
-    scenario = make_scenario(which, backend)
+    scenario = make_scenario(which, backend, reward)
     default = preset(scenario, method, profile)
     return (
         scenario,
@@ -274,12 +274,15 @@ def _evaluate(arguments: Sequence[str]) -> None:
     if asked.json:
         print("\n".join(json.dumps(row) for row in rows))
         return
-    print(f"{'task':<28}{'seed':>6}{'return':>12}{'std':>10}{'steps':>10}")
+    solved = [name for name in ("success", "success_last") if name in rows[0]]
+    heads = "".join(f"{name:>14}" for name in solved)
+    print(f"{'task':<28}{'seed':>6}{'return':>12}{'std':>10}{'steps':>10}{heads}")
     for row in rows:
         task = f"{row['task']} {row['name']}"
+        shares = "".join(f"{row[name]:>14.2f}" for name in solved)
         print(
             f"{task:<28}{row['seed']:>6}{row['return']:>12.1f}{row['std']:>10.1f}"
-            f"{row['steps']:>10}"
+            f"{row['steps']:>10}{shares}"
         )
 
 

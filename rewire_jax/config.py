@@ -101,13 +101,17 @@ class Settings:
       method: name of the method.
       profile: whose values the settings started from.
       backend: physics backend.
+      reward: version of the rewards, where an environment has several.
       seed: seed of the first member.
       seeds: how many members, seeded one after the other.
       tasks: how many tasks of the sequence are run.
       interactions: training interactions (environment steps) for each task.
       paper_interactions: the same in the paper, for comparison in reports.
       envs: parallel environments of a member.
-      updates: SAC updates after each step of all environments.
+      updates: SAC updates at a time.
+      update_every: steps of all environments from one time to the next.
+      overlap: step environments that cannot be compiled while updates are made, by the
+        policy before these updates.
       warmup: interactions of each task before its first update.
       random_interactions: interactions of each task with uniform actions.
       buffer: transitions kept at most.
@@ -124,6 +128,7 @@ class Settings:
     method: str
     profile: str
     backend: str
+    reward: str = "v2"
     seed: int = 0
     seeds: int = 1
     tasks: int
@@ -131,6 +136,8 @@ class Settings:
     paper_interactions: Annotated[int, tyro.conf.Suppress]
     envs: int = 128
     updates: int = 64
+    update_every: int = 1
+    overlap: bool = False
     warmup: int = 12_800
     random_interactions: int = 0
     buffer: int = 1_280_000
@@ -148,6 +155,7 @@ _AT_LEAST: dict[str, float] = {
     "tasks": 1,
     "envs": 1,
     "updates": 1,
+    "update_every": 1,
     "warmup": 0,
     "random_interactions": 0,
     "buffer": 1,
@@ -201,7 +209,7 @@ def validate(run: Settings) -> None:
             f"{flag(name)} must lie in (0, 1], not {values[name]}",
         )
     require(
-        run.interactions >= run.warmup + run.envs,
+        run.interactions >= run.warmup + run.envs * run.update_every,
         f"--interactions {run.interactions} leaves nothing to learn from after "
         f"--warmup {run.warmup}: raise the one or lower the other",
     )

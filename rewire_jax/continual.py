@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax import config, runfolder, standing, training
+from rewire_jax import config, rollout, runfolder, standing, training
 from rewire_jax.config import Settings
 from rewire_jax.envs.base import Task
 from rewire_jax.methods.base import Selection
@@ -145,12 +145,13 @@ class Run:
         """Trains until the next progress report."""
         began = clock.perf_counter()
         program, members, stage = self.plan.program, self.plan.members, now.stage
-        done, steps = now.steps, self.due(now.steps, self.plan.steps)
-        compiled = program.chunk._cache_size()  # type: ignore[attr-defined]
+        done, unit = now.steps, self.plan.settings.update_every
+        steps = self.due(done, self.plan.steps, unit)
+        traces = program.traces()
         state, report = program.chunk(members, now.state, stage, task, done, steps)
         report = jax.tree.map(np.asarray, report)
         seconds = clock.perf_counter() - began
-        compiles = program.chunk._cache_size() > compiled  # type: ignore[attr-defined]
+        compiles = program.traces() > traces
         now = self.advance(now, state, steps)
         self.log(now, report, seconds, compiles, steps)
         if now.steps == self.plan.steps and program.consolidate:
@@ -164,7 +165,7 @@ class Run:
         began = clock.perf_counter()
         plan, stage = self.plan, now.stage
         before = now.steps
-        steps = self.due(before, plan.steps + plan.polishing)
+        steps = self.due(before, plan.steps + plan.polishing, 1)
         compiled = plan.program.polish._cache_size()  # type: ignore[attr-defined]
         state = plan.program.polish(
             plan.members, now.state, stage, plan.steps, before - plan.steps, steps
@@ -189,9 +190,14 @@ class Run:
         self.save(now, before)
         return now
 
-    def due(self, done: int, end: int) -> int:
-        """Steps until the next progress report, or until the end."""
-        every = max(self.plan.settings.report_every // self.plan.settings.envs, 1)
+    def due(self, done: int, end: int, unit: int) -> int:
+        """Steps until the next progress report, or until the end.
+
+        `unit` is that of steps between two times of updates.
+        """
+        settings = self.plan.settings
+        times = settings.report_every // (settings.envs * settings.update_every)
+        every = max(times, 1) * unit
         return min(every - done % every, end - done)
 
     def advance(self, now: Standing, state: training.State, steps: int) -> Standing:
@@ -246,6 +252,8 @@ class Run:
                 "return": _finite(score),
                 "reward": _finite(reward),
             }
+            for name, solved in rollout.named(report.successes).items():
+                row[name] = float(solved[place]) / ended if ended else None
             for name, values in report.inspected.items():
                 metrics[name] = _finite(float(values[place]))
             rows.append(row | metrics)
@@ -297,12 +305,15 @@ class Run:
         def play(stream):
             keys = self.keys(stream, stage + 1, settings.tasks)
             result = program.rollout(plan.tasks, policies, keys, settings.eval_episodes)
-            return np.asarray(result.returns, np.float64).mean(axis=2)
+            means = {"return": result.returns} | rollout.named(result.success)
+            return {
+                name: np.asarray(values, np.float64).mean(axis=2)
+                for name, values in means.items()
+            }
 
-        streams = {"return": _EVALUATION}
+        scores = play(_EVALUATION)
         if self.choosing:
-            streams["choice"] = _CHOICE
-        returns = {name: play(stream) for name, stream in streams.items()}
+            scores["choice"] = play(_CHOICE)["return"]
         sizes = np.asarray(program.size(members, now.learner))
         rows = [
             {
@@ -319,14 +330,14 @@ class Run:
                 "diverged": not bool(now.alive[place]),
                 "model_size": int(sizes[place]) / base_size(plan.spec),
             }
-            | {name: _finite(float(x[place, index])) for name, x in returns.items()}
+            | {name: _finite(float(x[place, index])) for name, x in scores.items()}
             for place, member in enumerate(plan.crowd)
             for index in range(settings.tasks)
         ]
         runfolder.append(self.folder, "results.jsonl", rows)
         for row in rows:
             self.events.evaluation(row)
-        return returns["return"][: len(plan.crowd)]
+        return scores["return"][: len(plan.crowd)]
 
 
 def _finite(value: float | None) -> float | None:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax import checkpoint, config, runfolder, standing
+from rewire_jax import checkpoint, config, rollout, runfolder, standing
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.plan import base_size, make_spec, prepare
@@ -90,7 +90,8 @@ def evaluate(
 
     Returns:
       A row for each member and task: task, name, seed (the member's), return, std
-      (over episodes), steps (in all episodes).
+      (over episodes), steps (in all episodes), and, where it is known, success and
+      success_last: shares of the episodes solved at any step, and at the last.
 
     Raises:
       UserError: no such run or stage, or a damaged checkpoint.
@@ -109,6 +110,7 @@ def evaluate(
     keys = jax.random.split(jax.random.key(seed), (plan.places, len(plan.names)))
     result = plan.program.rollout(plan.tasks, policies, keys, episodes)
     returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
+    solved = {n: np.asarray(x) for n, x in rollout.named(result.success).items()}
     return [
         {
             "task": task,
@@ -118,6 +120,7 @@ def evaluate(
             "std": float(returns[place, task].std()),
             "steps": int(lengths[place, task].sum()),
         }
+        | {name: float(x[place, task].mean()) for name, x in solved.items()}
         for place, member in enumerate(plan.crowd)
         for task, name in enumerate(plan.names)
     ]

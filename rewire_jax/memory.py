@@ -19,6 +19,7 @@ from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
 
 from rewire_jax import noise, training
 from rewire_jax.config import require
+from rewire_jax.envs.base import Environment
 from rewire_jax.methods import find_method
 from rewire_jax.plan import Plan
 
@@ -64,7 +65,7 @@ def need(plan: Plan) -> Need:
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     fresh = jax.eval_shape(program.init, plan.members)
     alive = jax.ShapeDtypeStruct((plan.places,), bool)
-    state = jax.eval_shape(program.begin, plan.members, fresh, alive, 0, task)
+    state = program.expect(plan.members, fresh, alive, 0, task)
     policies = jax.eval_shape(program.policies, plan.members, fresh)
 
     def learn(member, state):
@@ -79,19 +80,23 @@ def need(plan: Plan) -> Need:
             settings=member.sac,
         )
 
-    def step(member, task, policy, now):
-        mean, _ = make(spec, member.options).act(policy, now.observation)
-        return environment.step(task, now, mean)
-
     def one(tree: Any) -> Any:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), tree)
 
     member, mine, policies = one(plan.members), one(state), one(policies)
-    start = jax.eval_shape(environment.reset, task, member.keys)
-    episode = max(
-        peak(environment.reset, task, member.keys),
-        size(start) + peak(step, member, task, one(policies), start),
-    )
+    episode = 0  # on the host it takes nothing of the device
+    if isinstance(environment, Environment):
+        simulate = environment.step
+
+        def step(member, task, policy, now):
+            mean, _ = make(spec, member.options).act(policy, now.observation)
+            return simulate(task, now, mean)
+
+        start = jax.eval_shape(environment.reset, task, member.keys)
+        episode = max(
+            peak(environment.reset, task, member.keys),
+            size(start) + peak(step, member, task, one(policies), start),
+        )
     learner = size(mine.learner)
     work = [
         learner,  # a task's start and end each make one from the other

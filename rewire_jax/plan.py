@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from rewire_jax import config, networks, population, program, training
 from rewire_jax.config import Settings, require
-from rewire_jax.envs.base import Environment, Task
+from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec, count
 from rewire_jax.population import Member, Members
@@ -61,7 +61,7 @@ class Plan(NamedTuple):
         return self.steps * self.settings.envs
 
 
-def make_spec(settings: Settings, environment: Environment) -> Spec:
+def make_spec(settings: Settings, environment: Environment | HostEnvironment) -> Spec:
     """The static sizes that a method is made from."""
     return Spec(
         observations=environment.observation_size,
@@ -100,7 +100,9 @@ def prepare(
     config.validate(settings)
     entry = find_method(settings.method)
     settings = dataclasses.replace(settings, options=settings.options.checked())
-    scenario = scenario or make_scenario(settings.scenario, settings.backend)
+    scenario = scenario or make_scenario(
+        settings.scenario, settings.backend, settings.reward
+    )
     require(
         settings.tasks <= len(scenario.tasks),
         f"--tasks {settings.tasks}: {scenario.name} has {len(scenario.tasks)}",
@@ -113,6 +115,13 @@ def prepare(
         warmup=settings.warmup // settings.envs,
         random=settings.random_interactions // settings.envs,
         transitions=min(settings.interactions, settings.buffer) // settings.envs,
+        every=settings.update_every,
+        overlap=settings.overlap,
+    )
+    require(
+        not settings.overlap or isinstance(environment, HostEnvironment),
+        f"--overlap: {scenario.name} on {scenario.backend} steps on the device, where "
+        "nothing is left to overlap",
     )
     sequence = scenario.tasks[: settings.tasks]
     seeds = range(settings.seed, settings.seed + settings.seeds)
@@ -125,12 +134,12 @@ def prepare(
     built = program.build(environment, entry.make, spec, shape, example, mesh)
     method = entry.make(spec, settings.options)
     number, rows = _selection(settings, built, members)
-    budget = settings.interactions
+    budget, round_ = settings.interactions, settings.update_every * settings.envs
     if method.in_budget:
         played = number * settings.selection_episodes
         budget -= played * environment.episode_length
         require(
-            budget >= settings.warmup + settings.envs,
+            budget >= settings.warmup + round_,
             f"--interactions {settings.interactions} must also pay for "
             f"{played} episodes of choosing between policies: raise it, or "
             "lower --selection-episodes or --warmup",
@@ -141,7 +150,7 @@ def prepare(
         tasks=jax.tree.map(lambda *x: jnp.stack(x), *[t.data for t in sequence]),
         names=tuple(task.name for task in sequence),
         crowd=tuple(crowd),
-        steps=budget // settings.envs,
+        steps=budget // round_ * settings.update_every,
         polishing=-(-int(method.offline * settings.interactions) // settings.updates),
         rows=rows,
         spec=spec,

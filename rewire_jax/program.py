@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from rewire_jax import population, replay, rollout, sac, training
-from rewire_jax.envs.base import Environment, Task
+from rewire_jax import hosted, population, replay, rollout, sac, training
+from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools
 from rewire_jax.training import Collection, Report, Shape, State
 
@@ -32,6 +32,8 @@ class Program(NamedTuple):
       finish: `(members, learner, index, Selection or None) -> Learner`.
       policies: `(members, learner) -> policies [members, tasks]`.
       rollout: `(tasks, policies, keys, count) -> Rollout`, see `rollout.episodes`.
+      expect: what `begin` gives for the same arguments, as shapes.
+      traces: `() -> int`, how often a function that trains was traced so far.
       size: `(members, learner) -> [members]`, numbers stored.
       baseline: whether candidates are rolled out at a task's start, too.
     """
@@ -45,6 +47,8 @@ class Program(NamedTuple):
     finish: Callable[..., sac.Learner]
     policies: Callable[..., Any]
     rollout: Callable[..., rollout.Rollout]
+    expect: Callable[..., State]
+    traces: Callable[[], int]
     size: Callable[..., jax.Array]
     baseline: bool
 
@@ -71,7 +75,7 @@ def rollout_function(
 
 @functools.lru_cache
 def build(
-    environment: Environment,
+    environment: Environment | HostEnvironment,
     make: Callable[[Spec, Any], Method],
     spec: Spec,
     shape: Shape,
@@ -99,10 +103,10 @@ def build(
         key = jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
         return jax.random.split(key, 4)
 
-    def begin(member, learner, alive, index, task):
+    def start(member, learner, alive, index, episodes):
         method = make(spec, member.options)
         keys = jax.random.split(task_keys(member, index)[0], 4)
-        start_key, reset_key, critic_key, label_key = keys
+        start_key, _, critic_key, label_key = keys
         params, memory = method.start_task(
             start_key, learner.params, learner.memory, index
         )
@@ -110,8 +114,6 @@ def build(
         if method.fresh_critic:
             critic = sac.init_critic(critic_key, spec, method.extra)
             learner = learner._replace(critic=critic)
-        keys = jax.random.split(reset_key, shape.envs)
-        episodes = jax.vmap(lambda k: rollout.begin(environment, task, k))(keys)
         label = method.label(label_key, memory, None, episodes.steps)
         buffer = replay.create(
             episodes.state.observation,
@@ -121,20 +123,8 @@ def build(
             label=label,
         )
         learner = sac.restart(learner, member.sac)
-        return State(learner, Collection(buffer, episodes, label), alive)
-
-    def chunk(member, state, index, task, time, steps):
-        return training.train(
-            task_keys(member, index)[1],
-            state,
-            task,
-            time,
-            steps,
-            environment=environment,
-            method=make(spec, member.options),
-            settings=member.sac,
-            shape=shape,
-        )
+        acting = (learner.params, learner.memory) if shape.overlap else ()
+        return State(learner, Collection(buffer, episodes, label), alive, acting)
 
     def consolidate(member, state, index, time):
         method = make(spec, member.options)
@@ -188,28 +178,78 @@ def build(
         policy = functools.partial(method.policy, learner.params, learner.memory)
         return jax.vmap(policy)(jnp.arange(spec.tasks))
 
-    def rollout_episodes(tasks, policies, keys, count):
-        rows = keys.shape[1]
-        function = rollout_function(environment, method.act, rows, count, mesh)
-        return function(tasks, policies, keys)
-
     def size(member, learner):
         return make(spec, member.options).size(learner.params, learner.memory)
 
     def over(function, *axes, donate=()):
         return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
 
+    def method_of(member):
+        return make(spec, member.options)
+
     method = make(spec, example)
+    parts = method_of, method.act, task_keys, start, shape, mesh
+    if isinstance(environment, HostEnvironment):
+        loop = hosted.loop(environment, *parts)
+    else:
+        loop = _loop(environment, *parts)
     return Program(
         init=over(init, 0),
-        begin=over(begin, 0, 0, 0, None, None),
-        chunk=over(chunk, 0, 0, None, None, None, None, donate=(1,)),
         consolidate=method.consolidate and over(consolidate, 0, 0, None, None),
         polish=over(polish, 0, 0, None, None, None, None, donate=(1,)),
         candidates=method.candidates and over(candidates, 0, 0, None),
         finish=over(finish, 0, 0, None, 0),
         policies=over(policies, 0, 0),
-        rollout=rollout_episodes,
         size=over(size, 0, 0),
         baseline=method.baseline,
+        **loop._asdict(),
+    )
+
+
+def _loop(
+    environment: Environment,
+    make: Callable[[Any], Method],
+    act: Callable[..., Any],
+    task_keys: Callable[[Any, Any], jax.Array],
+    start: Callable[..., State],
+    shape: Shape,
+    mesh: Mesh,
+) -> hosted.Loop:
+    """The loop of an environment that is compiled with the rest; see `hosted.loop`."""
+
+    def begin(member, learner, alive, index, task):
+        reset_key = jax.random.split(task_keys(member, index)[0], 4)[1]
+        keys = jax.random.split(reset_key, shape.envs)
+        episodes = jax.vmap(lambda k: rollout.begin(environment, task, k))(keys)
+        return start(member, learner, alive, index, episodes)
+
+    def chunk(member, state, index, task, time, steps):
+        return training.train(
+            task_keys(member, index)[1],
+            state,
+            task,
+            time,
+            steps,
+            environment=environment,
+            method=make(member),
+            settings=member.sac,
+            shape=shape,
+        )
+
+    def over(function, *axes, donate=()):
+        return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
+
+    def episodes(tasks, policies, keys, count):
+        rows = keys.shape[1]
+        function = rollout_function(environment, act, rows, count, mesh)
+        return function(tasks, policies, keys)
+
+    begins = over(begin, 0, 0, 0, None, None)
+    trains = over(chunk, 0, 0, None, None, None, None, donate=(1,))
+    return hosted.Loop(
+        begin=begins,
+        chunk=trains,
+        rollout=episodes,
+        expect=functools.partial(jax.eval_shape, begins),
+        traces=trains._cache_size,
     )

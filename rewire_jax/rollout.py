@@ -21,6 +21,11 @@ class Success(NamedTuple):
     last: jax.Array
 
 
+def named(success: Any) -> dict[str, Any]:
+    """The parts of a `Success` by their names in result files; none of `()`."""
+    return {"success": success.any, "success_last": success.last} if success else {}
+
+
 class Episode(NamedTuple):
     """One environment in training.
 

@@ -1,13 +1,20 @@
-"""Sequences of tasks, as data: the paper's Brax scenarios and one probe."""
+"""Sequences of tasks, as data: the paper's scenarios and one probe."""
 
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from rewire_jax.envs import probe
-from rewire_jax.envs.base import Domain, Environment, Task, TaskChange
+from rewire_jax.envs import metaworld, probe
+from rewire_jax.envs.base import (
+    Domain,
+    Environment,
+    HostEnvironment,
+    Task,
+    TaskChange,
+)
 from rewire_jax.errors import UserError
 
 
@@ -17,7 +24,7 @@ class ScenarioSpec:
 
     Attributes:
       name: what it is called, `"domain/kind"` by custom.
-      domain: `"halfcheetah"`, `"ant"`, `"humanoid"` or a probe's name.
+      domain: `"halfcheetah"`, `"ant"`, `"humanoid"`, `"metaworld"` or a probe's name.
       changes: the tasks in order; equal changes are the same task, met again.
       repeats: how often the whole list is gone through.
       interactions: environment steps of training for each task.
@@ -33,8 +40,8 @@ class ScenarioSpec:
     interactions: int
 
     def __post_init__(self) -> None:
-        if self.domain not in _DOMAINS:
-            raise UserError(_unknown("domain", self.domain, list(_DOMAINS)))
+        if self.domain not in DOMAINS:
+            raise UserError(_unknown("domain", self.domain, list(DOMAINS)))
         if not self.changes:
             raise UserError(f"Scenario {self.name!r} needs at least one change.")
         if self.repeats < 1:
@@ -83,7 +90,8 @@ class Scenario:
     Attributes:
       name: of its spec.
       domain: name of its domain.
-      backend: Brax's physics backend, `"probe"` for a probe.
+      backend: physics backend, `"probe"` for a probe.
+      reward: version of the rewards, where the domain has several.
       environment: shared by all tasks; identical for one domain and backend.
       tasks: the whole sequence, repeats included.
       distinct: number of distinct tasks.
@@ -93,32 +101,37 @@ class Scenario:
     name: str
     domain: str
     backend: str
-    environment: Environment
+    reward: str
+    environment: Environment | HostEnvironment
     tasks: tuple[ScenarioTask, ...]
     distinct: int
     interactions: int
 
 
-def make_scenario(spec: ScenarioSpec | str, backend: str = "positional") -> Scenario:
+def make_scenario(
+    spec: ScenarioSpec | str, backend: str | None = None, reward: str = "v2"
+) -> Scenario:
     """Builds a scenario.
 
     Args:
       spec: a spec, or the name of a known one.
-      backend: Brax's physics backend; probes ignore it.
+      backend: physics backend, the domain's first if None; probes ignore it.
+      reward: version of Meta-World's rewards, `"v1"` or `"v2"`; others ignore it.
 
     Returns:
       The scenario, its tasks ready for the environment.
 
     Raises:
-      UserError: an unknown scenario, backend, body or joint.
+      UserError: an unknown scenario, backend, reward, body or joint.
     """
     if isinstance(spec, str):
         if spec not in SCENARIOS:
             raise UserError(_unknown("scenario", spec, list(SCENARIOS)))
         spec = SCENARIOS[spec]
-    if spec.domain in probe.NAMES:
-        backend = "probe"
-    domain = _DOMAINS[spec.domain](spec.domain, backend)
+    kind = DOMAINS[spec.domain]
+    if backend is None or kind.backend == "probe":
+        backend = kind.backend
+    domain = kind.make(spec, backend, reward)
     names = list(dict.fromkeys(change.name for change in spec.changes))
     changes = {change.name: change for change in spec.changes}
     data = {name: domain.make_task(changes[name]) for name in names}
@@ -130,6 +143,7 @@ def make_scenario(spec: ScenarioSpec | str, backend: str = "positional") -> Scen
         name=spec.name,
         domain=spec.domain,
         backend=backend,
+        reward=reward,
         environment=domain.environment,
         tasks=tuple(once * spec.repeats),
         distinct=len(names),
@@ -159,22 +173,40 @@ def _unknown(kind: str, name: str, known: list[str]) -> str:
     return f"Unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}."
 
 
-def _make_brax(name: str, backend: str) -> Domain:
+class DomainKind(NamedTuple):
+    """How a domain is made.
+
+    Attributes:
+      make: `(spec, backend, reward) -> Domain`.
+      backend: that it is made for where none is named.
+    """
+
+    make: Callable[[ScenarioSpec, str, str], Domain]
+    backend: str
+
+
+def _make_brax(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
     # Brax takes seconds to import, and most commands do not need it.
     from rewire_jax.envs import brax
 
-    return brax.make_domain(name, backend)
+    return brax.make_domain(spec.domain, backend)
 
 
-def _make_probe(name: str, backend: str) -> Domain:
-    return probe.make_domain(name)
+def _make_metaworld(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
+    names = dict.fromkeys(str(change.extra.get("task")) for change in spec.changes)
+    return metaworld.make_domain(backend, reward, tuple(names))
 
 
-_DOMAINS: dict[str, Callable[[str, str], Domain]] = {
-    "halfcheetah": _make_brax,
-    "ant": _make_brax,
-    "humanoid": _make_brax,
-    **dict.fromkeys(probe.NAMES, _make_probe),
+def _make_probe(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
+    return probe.make_domain(spec.domain)
+
+
+DOMAINS: dict[str, DomainKind] = {
+    "halfcheetah": DomainKind(_make_brax, "positional"),
+    "ant": DomainKind(_make_brax, "positional"),
+    "humanoid": DomainKind(_make_brax, "positional"),
+    "metaworld": DomainKind(_make_metaworld, "mujoco"),
+    **dict.fromkeys(probe.NAMES, DomainKind(_make_probe, "probe")),
 }
 
 _NORMAL = TaskChange("normal")
@@ -259,6 +291,11 @@ def _brax_spec(name: str, tasks: str) -> ScenarioSpec:
     return ScenarioSpec(name, domain, changes, repeats, interactions)
 
 
+def _continual_world_spec(name: str, tasks: str) -> ScenarioSpec:
+    changes = tuple(TaskChange(task, extra={"task": task}) for task in tasks.split())
+    return ScenarioSpec(f"continual_world/{name}", "metaworld", changes, 1, 1_000_000)
+
+
 SCENARIOS: dict[str, ScenarioSpec] = {}
 for _name, _tasks in (
     ("halfcheetah/forgetting", "hugefoot moon carry_stuff rainfall"),
@@ -285,6 +322,25 @@ for _name, _tasks in (
     ("humanoid/hard", "normal moon carrystuff tinyfeet"),
 ):
     register_scenario(_brax_spec(_name, _tasks))
+for _name, _tasks in (
+    ("t1", "push window-close hammer"),
+    ("t2", "hammer window-close faucet-close"),
+    ("t3", "window-close handle-press-side peg-unplug-side"),
+    ("t4", "faucet-close shelf-place peg-unplug-side"),
+    ("t5", "faucet-close shelf-place push-back"),
+    ("t6", "stick-pull peg-unplug-side stick-pull"),
+    ("t7", "stick-pull push-back push-wall"),
+    ("t8", "push-wall shelf-place push-back"),
+    (
+        "cw10",
+        "hammer push-wall faucet-close push-back stick-pull handle-press-side push"
+        " shelf-place window-close peg-unplug-side",
+    ),
+):
+    register_scenario(_continual_world_spec(_name, _tasks))
+# Each task alone: what transfer to it is measured against.
+for _change in SCENARIOS["continual_world/cw10"].changes:
+    register_scenario(_continual_world_spec(_change.name, _change.name))
 register_scenario(
     ScenarioSpec("probe/reach", "reach", tuple(_REACH.values()), 1, 10_000)
 )

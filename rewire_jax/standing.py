@@ -133,8 +133,8 @@ def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, int]]:
     saved = checkpoint.read_metadata(path)["items"]
     if "state" in saved:
         task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-        like["state"] = jax.eval_shape(
-            program.begin, members, learner, like["counts"]["alive"], 0, task
+        like["state"] = program.expect(
+            members, learner, like["counts"]["alive"], 0, task
         )
     else:
         like |= _kept(learner)

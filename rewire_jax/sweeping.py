@@ -241,7 +241,9 @@ def sweep(
         require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
         configurations = draws(given, random, settings) if random else grid(given)
     settings, crowd = _crowd(settings, configurations)
-    scenario = scenario or make_scenario(settings.scenario, settings.backend)
+    scenario = scenario or make_scenario(
+        settings.scenario, settings.backend, settings.reward
+    )
     plan = prepare(settings, scenario, crowd[:1])
     members = [
         {

@@ -22,6 +22,8 @@ class Shape(NamedTuple):
       random: steps of all environments with uniform actions.
       transitions: steps of all environments that the buffer holds.
       every: steps of all environments from one time to the next.
+      overlap: whether environments on the host are stepped while updates are made, by
+        the policy before these updates.
     """
 
     envs: int
@@ -30,6 +32,7 @@ class Shape(NamedTuple):
     random: int
     transitions: int
     every: int = 1
+    overlap: bool = False
 
     def due(self, steps: Any) -> Any:
         """Whether there are updates after so many steps, an int or `[]`."""
@@ -61,11 +64,13 @@ class State(NamedTuple):
       learner: all that learning changes.
       collection: all that collecting changes.
       alive: `[]` bool; once a value is not finite the learner is updated no more.
+      acting: parameters and memory that act next, with `Shape.overlap`; else `()`.
     """
 
     learner: sac.Learner
     collection: Collection
     alive: jax.Array
+    acting: Any = ()
 
 
 class Report(NamedTuple):
@@ -178,7 +183,7 @@ def collect(
     sequence: jax.Array | None,
 ) -> tuple[Collection, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
-    learner, (buffer, episodes, label), _ = state
+    learner, (buffer, episodes, label), *_ = state
     action, label = explore(
         key,
         (learner.params, learner.memory),

@@ -76,6 +76,9 @@ def preset(scenario: str, period: int, profile: str) -> CspSettings:
     """Published settings or the defaults; a shorter search in the quick profile."""
     del period
     options = CspSettings()
+    if scenario.startswith("continual_world/"):
+        # Its episodes have 200 steps: about as many interactions as elsewhere.
+        options = CspSettings(rollouts=32)
     if scenario in _PUBLISHED:
         distribution, every = _PUBLISHED[scenario]
         options = CspSettings(distribution=distribution, resample_every=every)

@@ -1,0 +1,104 @@
+"""Simulators side by side on the host, each in a process of its own."""
+
+import functools
+import os
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rewire_jax.envs.base import HostEnvironment
+
+Array = NDArray[Any]
+
+
+class Moment(NamedTuple):
+    """What a step gave in each lane.
+
+    Attributes:
+      observation: `[lanes, observations]` float32.
+      reward: `[lanes]` float32.
+      terminal: `[lanes]` bool, ended by the task.
+      success: `[lanes]` bool; False where none is known.
+    """
+
+    observation: Array
+    reward: Array
+    terminal: Array
+    success: Array
+
+
+class Lanes:
+    """Simulators that are reset and stepped together.
+
+    They are no state of a run, but remember where they are: what seeds and actions
+    lead to can be had again by resetting and stepping.
+
+    Attributes:
+      task: index of the task that is played, -1 before the first reset.
+      seeds: `[lanes]` int64, of the running episodes.
+      steps: `[lanes]` int, of the running episodes.
+      observation: `[lanes, observations]`, the latest.
+    """
+
+    def __init__(self, environment: HostEnvironment, count: int):
+        """Makes the simulators; a single one lives in this process."""
+        # Only those who have such an environment have gymnasium.
+        from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+        makers = [environment.make] * count
+        mode = AutoresetMode.DISABLED
+        self._vector = (
+            SyncVectorEnv(makers, autoreset_mode=mode)
+            if count == 1
+            # JAX has threads, which a forked process would lack.
+            else AsyncVectorEnv(
+                makers,
+                context="spawn",
+                autoreset_mode=mode,
+                max_concurrency=os.cpu_count(),
+            )
+        )
+        self.task = -1
+        self.seeds = np.zeros(count, np.int64)
+        self.steps = np.zeros(count, np.int64)
+        self.observation = np.zeros((count, environment.observation_size), np.float32)
+
+    def reset(
+        self, task: int, seeds: Sequence[int] | Array, where: Array | None = None
+    ) -> Array:
+        """Begins episodes.
+
+        Args:
+          task: its index, the same in all lanes.
+          seeds: `[lanes]` int.
+          where: `[lanes]` bool, the lanes that begin one; all if None.
+
+        Returns:
+          `[lanes, observations]` float32, the latest of each lane.
+        """
+        where = np.ones(len(self.seeds), bool) if where is None else where
+        options = {"task": task, "reset_mask": where}
+        given: list[int | None] = [int(seed) for seed in seeds]
+        self.observation, _ = self._vector.reset(seed=given, options=options)
+        self.task = task
+        self.seeds = np.where(where, given, self.seeds)
+        self.steps = np.where(where, 0, self.steps)
+        return self.observation
+
+    def step(self, actions: Array) -> Moment:
+        """Steps all lanes; `actions` is `[lanes, actions]` float32 in [-1, 1]."""
+        observation, reward, terminal, _, info = self._vector.step(actions)
+        self.observation = observation
+        self.steps = self.steps + 1
+        success = info.get("success", np.zeros(len(self.seeds), bool))
+        return Moment(
+            observation, reward.astype(np.float32), terminal, success.astype(bool)
+        )
+
+
+@functools.lru_cache(maxsize=1)
+def open_lanes(environment: HostEnvironment, count: int) -> Lanes:
+    """So many lanes; asked for again, the same, since starting them takes seconds."""
+    return Lanes(environment, count)
