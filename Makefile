@@ -1,10 +1,17 @@
 # Everything a developer runs. Needs make and Python 3.11 or newer, nothing else.
 
 VENV := .venv
+PINS := constraints.txt
+EXTRAS := dev
+# What ends in -mjx has an environment of its own: MTCWorldMJX needs another MuJoCo than
+# metaworld does.
+%-mjx %-mjx/.installed: VENV := .venv-mjx
+%-mjx %-mjx/.installed: PINS := constraints-mjx.txt
+%-mjx %-mjx/.installed: EXTRAS := cw-mjx,test
+
 # Deferred: Python is looked for only where it is used.
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
-RUN := $(VENV)/bin/python
-STAMP := $(VENV)/.installed
+RUN = $(VENV)/bin/python
 # A file's tests share what they train, so they stay in one process.
 WORKERS ?= -n 2 --dist loadfile
 
@@ -14,13 +21,16 @@ option = $(if $(strip $(2)),--$(1) $(2))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup lock lint format test test-slow bench-brax bench-speed readme clean
+.PHONY: help setup setup-mjx lock lock-mjx lint format test test-slow test-mjx \
+	bench-brax bench-speed bench-mjx readme clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS BACKEND OUT KEEP where set.'
 
-setup: $(STAMP) ## Make .venv with the pinned versions (does nothing when up to date)
+setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
+
+setup-mjx: .venv-mjx/.installed ## Make .venv-mjx: Meta-World on MJX-Warp instead of C MuJoCo
 
 # An environment that can run pip is kept, anything else is made anew.
 define make_venv
@@ -33,25 +43,29 @@ define make_venv
 	"$(PYTHON)" -m venv --clear $(VENV); }
 endef
 
-$(STAMP): pyproject.toml constraints.txt
+.venv/.installed: constraints.txt
+.venv-mjx/.installed: constraints-mjx.txt
+.venv/.installed .venv-mjx/.installed: pyproject.toml
 	$(make_venv)
 	$(RUN) -m pip install --quiet --disable-pip-version-check \
-		-c constraints.txt -e '.[dev]'
+		-c $(PINS) -e '.[$(EXTRAS)]'
 	@touch $@
 
-# Pins in constraints.txt stay; `make lock UPGRADE=1` looks for newer versions.
+# Pins that are there stay; `make lock UPGRADE=1` looks for newer versions.
 lock: ## Resolve the dependencies anew into constraints.txt (UPGRADE=1: newest)
+lock-mjx: ## The same into constraints-mjx.txt
+lock lock-mjx:
 	$(make_venv)
 	$(RUN) -m pip install --quiet --disable-pip-version-check \
 		--dry-run --ignore-installed --report $(VENV)/lock.json \
-		$(if $(UPGRADE),,-c constraints.txt) -e '.[dev]'
-	$(RUN) -c "$$LOCK" <$(VENV)/lock.json >$(VENV)/constraints.txt
-	mv $(VENV)/constraints.txt constraints.txt
+		$(if $(UPGRADE),,-c $(PINS)) -e '.[$(EXTRAS)]'
+	$(RUN) -c "$$LOCK" $@ <$(VENV)/lock.json >$(VENV)/$(PINS)
+	mv $(VENV)/$(PINS) $(PINS)
 
 define LOCK
 import json, sys
 
-print("# The versions that are tested together. Made by `make lock`: do not edit.")
+print(f"# The versions that are tested together. Made by `make {sys.argv[1]}`: do not edit.")
 packages = [item["metadata"] for item in json.load(sys.stdin)["install"]]
 for package in sorted(packages, key=lambda package: package["name"].lower()):
     if package["name"] != "rewire_jax":
@@ -74,6 +88,9 @@ test: lint ## Set up, lint, run all tests but the slow ones
 test-slow: setup ## Run the slow tests
 	$(RUN) -m pytest -m slow $(WORKERS)
 
+test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (compiles for minutes at first)
+	$(RUN) -m pytest tests/test_metaworld_mjx.py
+
 bench-brax: setup ## Run the methods on a Brax scenario, make its table and figures
 	$(RUN) -m experiments.bench_brax $(strip \
 		$(call option,scenario,$(SCENARIO)) \
@@ -88,6 +105,9 @@ bench-brax: setup ## Run the methods on a Brax scenario, make its table and figu
 
 bench-speed: setup ## Measure interactions and updates a second
 	$(RUN) -m experiments.bench_speed
+
+bench-mjx: setup-mjx ## Measure steps a second of Meta-World on MJX-Warp
+	$(RUN) -m experiments.bench_mjx
 
 readme: setup ## Make the tables of README.md anew from experiments/results
 	$(RUN) -m experiments.readme
