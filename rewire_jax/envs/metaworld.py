@@ -1,0 +1,70 @@
+"""Meta-World's manipulation tasks (v3) as a domain whose tasks are data.
+
+The observation has 39 numbers: hand (3), gripper (1), objects (14), the same 18 of the
+step before, and the goal (3). The action has four, in [-1, 1]: three move the hand by
+at most a centimetre each, one drives the gripper.
+"""
+
+import functools
+import importlib
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+
+from rewire_jax.envs import changes
+from rewire_jax.envs.base import Domain, Task, TaskChange
+from rewire_jax.errors import UserError
+
+BACKENDS = ("mujoco", "mjx")
+REWARDS = ("v1", "v2")
+JOINTS = ("x", "y", "z", "gripper")
+OBSERVATION_SIZE = 39
+EPISODE_LENGTH = 200  # Continual World's; the package's own is 500
+
+
+def make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
+    """Makes the domain of some tasks; the same arguments give the identical object.
+
+    A `TaskChange` names its task as `extra={"task": name}`. It may change actions by
+    joint name (`"x"`, `"y"`, `"z"`, `"gripper"`) and hide observations, nothing else.
+    `Task.physics` is the task's place in `names`.
+
+    Args:
+      backend: `"mujoco"`, the package `metaworld` on the host, or `"mjx"`, compiled.
+      reward: version of the reward, `"v1"` or `"v2"`.
+      names: the tasks, without their version: `"window-close"`.
+
+    Returns:
+      The domain.
+
+    Raises:
+      UserError: no such backend, reward or task, or the backend is not installed.
+    """
+    changes.check_names("Meta-World backend", [backend], BACKENDS)
+    changes.check_names("Meta-World reward", [reward], REWARDS)
+    return _make_domain(backend, reward, tuple(names))
+
+
+@functools.cache
+def _make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
+    # Each backend needs packages of its own, so only the one asked for is imported.
+    module = importlib.import_module(f"rewire_jax.envs.metaworld_{backend}")
+    environment = module.make_environment(reward, names)
+    return Domain(environment, functools.partial(_make_task, names))
+
+
+def _make_task(names: Sequence[str], change: TaskChange) -> Task:
+    if change.gravity != 1 or change.friction != 1 or change.bodies:
+        raise UserError("Meta-World tasks change no gravity, friction or bodies.")
+    if set(change.extra) != {"task"}:
+        raise UserError(
+            'A Meta-World task is named by extra={"task": name}, not by'
+            f" {dict(change.extra)}."
+        )
+    name = change.extra["task"]
+    changes.check_names("Meta-World task of this domain", [name], names)
+    return Task(
+        physics=jnp.asarray(names.index(name), jnp.int32),
+        action_scale=changes.action_scale(JOINTS, change.actions),
+        observation_mask=changes.observation_mask(OBSERVATION_SIZE, change.hidden),
+    )
