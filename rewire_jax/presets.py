@@ -139,7 +139,7 @@ def _continual_world(paper: Settings) -> Settings:
     return dataclasses.replace(
         paper,
         interactions=min(30_000, paper.interactions),
-        eval_episodes=10,
+        eval_episodes=20,
         selection_episodes=1 if paper.selection_episodes == 1 else 4,
         report_every=2_000,
         checkpoint_every=10_000,
