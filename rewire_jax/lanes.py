@@ -1,4 +1,4 @@
-"""Simulators side by side on the host, each in a process of its own."""
+"""Simulators side by side on the host, in processes where there are cores for them."""
 
 import functools
 import os
@@ -43,21 +43,18 @@ class Lanes:
     """
 
     def __init__(self, environment: HostEnvironment, count: int):
-        """Makes the simulators; a single one lives in this process."""
+        """Makes the simulators; a process each, unless this one is as fast."""
         # Only those who have such an environment have gymnasium.
         from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
         makers = [environment.make] * count
-        mode = AutoresetMode.DISABLED
+        mode, cores = AutoresetMode.DISABLED, _cores()
         self._vector = (
             SyncVectorEnv(makers, autoreset_mode=mode)
-            if count == 1
+            if min(count, cores) == 1
             # JAX has threads, which a forked process would lack.
             else AsyncVectorEnv(
-                makers,
-                context="spawn",
-                autoreset_mode=mode,
-                max_concurrency=os.cpu_count(),
+                makers, context="spawn", autoreset_mode=mode, max_concurrency=cores
             )
         )
         self.task = -1
@@ -83,7 +80,7 @@ class Lanes:
         given: list[int | None] = [int(seed) for seed in seeds]
         self.observation, _ = self._vector.reset(seed=given, options=options)
         self.task = task
-        self.seeds = np.where(where, given, self.seeds)
+        self.seeds = np.where(where, np.asarray(seeds), self.seeds)
         self.steps = np.where(where, 0, self.steps)
         return self.observation
 
@@ -96,6 +93,14 @@ class Lanes:
         return Moment(
             observation, reward.astype(np.float32), terminal, success.astype(bool)
         )
+
+
+def _cores() -> int:
+    """How many this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        return os.cpu_count() or 1
 
 
 @functools.lru_cache(maxsize=1)
