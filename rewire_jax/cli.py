@@ -28,6 +28,7 @@ from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS
 from rewire_jax.presets import preset
 from rewire_jax.scenarios import Scenario, list_scenarios, make_scenario
+from rewire_jax.scores import Success
 
 T = TypeVar("T")
 
@@ -109,10 +110,15 @@ class Report:
       runs: folders of the runs, finished or not; a SAC-N run normalises the others. Or
         the folder of one sweep.
       out: folder for the report; an earlier report there is replaced.
+      single: folders of runs that learn one task each, with the same budget: from
+        them Continual World's forward transfer is measured.
+      success: steps of an episode that count as solved, any or the last alone.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     out: Path = Path("report")
+    single: tuple[Path, ...] = ()
+    success: Success = "any"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -292,7 +298,10 @@ def _report(arguments: Sequence[str]) -> None:
         require(len(asked.runs) == 1, "a sweep is reported on alone")
         _show(sweepreport.write_sweep_report(asked.runs[0], asked.out))
         return
-    print(report.to_terminal(report.write_report(asked.runs, asked.out)), end="")
+    made = report.write_report(
+        asked.runs, asked.out, single=asked.single, success=asked.success
+    )
+    print(report.to_terminal(made), end="")
 
 
 def _info(arguments: Sequence[str]) -> None:

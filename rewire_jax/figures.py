@@ -16,6 +16,8 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
+from rewire_jax.scores import Score
+
 Array = NDArray[np.float64]
 
 # Okabe and Ito's palette, told apart with any colour vision; for its yellow, too pale
@@ -41,10 +43,10 @@ class Line(NamedTuple):
 
     Attributes:
         label: the method.
-        curve: per stage, interactions within the task `[points]` and training returns
-            `[seeds, points]`, NaN where there is none.
-        scores: evaluation returns `[seeds, 1 + stages, tasks]`, the first row before
-            any training, NaN where there is none.
+        curve: per stage, interactions within the task `[points]` and scores of
+            training `[seeds, points]`, NaN where there is none.
+        scores: evaluations `[seeds, 1 + stages, tasks]`, the first row before any
+            training, NaN where there is none.
     """
 
     label: str
@@ -74,14 +76,20 @@ def mean(values: Array) -> Array:
 
 
 def curves(
-    lines: Sequence[Line], tasks: Sequence[str], budget: int, title: str, path: Path
+    lines: Sequence[Line],
+    tasks: Sequence[str],
+    budget: int,
+    score: Score,
+    title: str,
+    path: Path,
 ) -> None:
-    """Writes the training returns over the whole sequence, tasks side by side.
+    """Writes the scores of training over the whole sequence, tasks side by side.
 
     Args:
         lines: one for each method.
         tasks: names of the sequence.
         budget: interactions a task.
+        score: what is shown.
         title: above the picture.
         path: the PNG file to write.
     """
@@ -91,7 +99,7 @@ def curves(
     for k, name in enumerate(tasks):
         axes.axvline(k * budget, color="0.6", linewidth=0.8, zorder=0)
         # One word a line: eight long names fit side by side.
-        label = name.replace("_", "\n")
+        label = name.replace("_", "\n").replace("-", "-\n")
         axes.annotate(
             label,
             xy=((k + 0.5) * budget, 1.0),
@@ -107,7 +115,11 @@ def curves(
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
     axes.set_xlabel("training interactions, each seed")
-    axes.set_ylabel("return")
+    axes.set_ylabel(score.noun)
+    if score.limits:
+        # Room for lines that run along an end.
+        low, high = score.limits
+        axes.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
     axes.grid(axis="y", color="0.9")
     axes.set_axisbelow(True)
     key = [Line2D([], [], **look(i), label=line.label) for i, line in enumerate(lines)]
@@ -115,14 +127,13 @@ def curves(
     entitle(
         figure,
         title,
-        "lines: training reward a step × steps of an episode, mean over seeds, "
-        "band from lowest to highest",
+        f"lines: {score.trained}, mean over seeds, band from lowest to highest",
     )
     figure.savefig(path)
 
 
 def matrices(
-    lines: Sequence[Line], tasks: Sequence[str], title: str, path: Path
+    lines: Sequence[Line], tasks: Sequence[str], score: Score, title: str, path: Path
 ) -> None:
     """Writes a heat map of task × stage for each method, means in the cells.
 
@@ -131,12 +142,14 @@ def matrices(
     Args:
         lines: one for each method.
         tasks: names of the sequence.
+        score: what is shown.
         title: above the picture.
         path: the PNG file to write.
     """
     maps = [mean(line.scores).T for line in lines]
     values = np.concatenate([m[~np.isnan(m)] for m in maps])
     low, high = (values.min(), values.max()) if values.size else (0.0, 1.0)
+    low, high = score.limits or (low, high)
     # Equal ends would give a scale without extent.
     scale = Normalize(low, high if high > low else low + 1)
     columns = int(np.ceil(np.sqrt(len(lines))))
@@ -188,7 +201,7 @@ def matrices(
         axes.set_axis_off()
     if image is not None:
         figure.colorbar(
-            image, ax=panels, label="return, mean over seeds", aspect=20 * rows
+            image, ax=panels, label=f"{score.noun}, mean over seeds", aspect=20 * rows
         )
     entitle(figure, title, "framed: right after own training")
     figure.savefig(path)
@@ -218,14 +231,14 @@ def look(i: int) -> dict[str, Any]:
 
 def _draw_curve(axes: Axes, i: int, line: Line, budget: int, alpha: float) -> None:
     """A method's curve, a piece for each task."""
-    for stage, (x, returns) in enumerate(line.curve):
-        middle = mean(returns)
+    for stage, (x, scores) in enumerate(line.curve):
+        middle = mean(scores)
         there = ~np.isnan(middle)
         x = x[there] + stage * budget
         if not x.size:
             continue
-        low = np.nanmin(returns[:, there], axis=0)
-        high = np.nanmax(returns[:, there], axis=0)
+        low = np.nanmin(scores[:, there], axis=0)
+        high = np.nanmax(scores[:, there], axis=0)
         colour = look(i)["color"]
         axes.fill_between(x, low, high, color=colour, alpha=alpha, linewidth=0)
         # A single point makes no line: its marker shows it.

@@ -2,9 +2,10 @@
 
 A matrix is `[..., stages, tasks]`: entry `[s, t]` is the score on task `t` after
 training on task `s`, so a whole sequence of T tasks gives `[..., T, T]`. The measures
-are those of the paper's section 4.1 and appendix A.3; interquartile mean and interval
-are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
-Statistical Precipice" (NeurIPS 2021).
+are those of the paper's section 4.1 and appendix A.3, and of Continual World (Wołczyk
+et al. 2021, arXiv 2105.10919), whose forgetting has the other sign; interquartile mean
+and interval are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of
+the Statistical Precipice" (NeurIPS 2021).
 """
 
 from collections.abc import Callable
@@ -110,6 +111,46 @@ def forward_transfer(matrix: ArrayLike, reference: ArrayLike) -> Scores:
         `[..., tasks]`.
     """
     return after_own_training(matrix) - np.asarray(reference, np.float64)
+
+
+def area(interactions: ArrayLike, scores: ArrayLike) -> Scores:
+    """Mean score over a task's training, the area under its curve.
+
+    Each score is what was seen since the last report, so it is weighted by the
+    interactions since then. Reports that saw nothing are left out with theirs.
+
+    Args:
+        interactions: `[points]`, increasing from above 0, within the task.
+        scores: `[..., points]`, NaN where nothing was seen.
+
+    Returns:
+        `[...]`, NaN where no report saw anything.
+    """
+    scores = np.asarray(scores, np.float64)
+    there = ~np.isnan(scores)
+    since = np.diff(np.asarray(interactions, np.float64), prepend=0.0)
+    weights = np.sum(since * there, axis=-1)
+    total = np.sum(since * np.where(there, scores, 0.0), axis=-1)
+    return np.where(weights > 0, total / np.where(weights > 0, weights, 1.0), np.nan)
+
+
+def area_transfer(areas: ArrayLike, alone: ArrayLike) -> Scores:
+    """Forward transfer of Continual World, for each task.
+
+    (AUC - AUC_b) / (1 - AUC_b) for success rates, AUC being `area`: 1 where the task is
+    solved from the first episode, 0 where nothing learned before was of use.
+
+    Args:
+        areas: `[..., tasks]`, in 0 to 1.
+        alone: `[tasks]`, AUC_b, of learning the task alone from scratch.
+
+    Returns:
+        `[..., tasks]`, NaN where AUC_b is 1, which nothing can exceed.
+    """
+    areas, alone = np.asarray(areas, np.float64), np.asarray(alone, np.float64)
+    room = 1.0 - alone
+    possible = room > 0
+    return np.where(possible, (areas - alone) / np.where(possible, room, 1.0), np.nan)
 
 
 def interquartile_mean(values: ArrayLike) -> Scores:

@@ -14,29 +14,37 @@ from rich.table import Table
 from rich.text import Text
 
 from rewire_jax import figures, tables
+from rewire_jax.config import require
 from rewire_jax.errors import UserError
-from rewire_jax.rundata import read_run
+from rewire_jax.rundata import RunData, read_run
 from rewire_jax.scatter import Point, tradeoff
 from rewire_jax.scenarios import SCENARIOS
-from rewire_jax.summary import MEASURES, Comparison, Summary, summarize
+from rewire_jax.scores import SUCCESS, Success
+from rewire_jax.summary import MEASURES, Comparison, Summary, Tasks, summarize
 
 _READING = (
-    "Returns are deterministic evaluations. Performance is the score at the end, "
-    "averaged over tasks; values are mean ± sample standard deviation over seeds. IQM "
-    "is the interquartile mean of the tasks' scores at the end over all seeds, with "
-    "its stratified bootstrap interval. Forgetting is the score at the end minus the "
-    "score right after own training: negative means forgotten. Training and selection "
-    "are interactions of each seed; hours are those of training. Forgetting of single "
-    "tasks is in returns."
+    "Performance is the score at the end, averaged over tasks; values are mean ± "
+    "sample standard deviation over seeds. IQM is the interquartile mean of the tasks' "
+    "scores at the end over all seeds, with its stratified bootstrap interval. "
+    "Forgetting is the score at the end minus the score right after own training: "
+    "negative means forgotten. Training and selection are interactions of each seed; "
+    "hours are those of training."
 )
 _NORMALISED = (
     "÷ SAC-N: performance, IQM, forgetting and transfer are divided by the mean return "
     "of SAC-N at the end, averaged over tasks and seeds. Forward transfer is the score "
     "right after own training minus that of SAC-N."
 )
-_PAPER = (
-    "The paper's columns are its published results, over SAC-N's on Brax v1: the "
-    "physics here is another."
+_CONTINUAL_WORLD = (
+    "Performance and forgetting are Continual World's, whose forgetting has the other "
+    "sign."
+)
+_TRANSFER = (
+    "Forward transfer is Continual World's: (AUC - AUC_b) / (1 - AUC_b) for each task, "
+    "AUC being the success rate of training episodes, averaged over the task's "
+    "interactions (progress reports that saw episodes end, weighted by the "
+    "interactions since the last report), and AUC_b its mean over the seeds of a run "
+    "that learns the task alone. It is undefined where AUC_b is 1."
 )
 
 
@@ -80,18 +88,34 @@ class Report:
         return *data, self.curves, self.matrix, self.tradeoff
 
 
-def write_report(runs: Sequence[str | Path], out: str | Path) -> Report:
+def write_report(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    single: Sequence[str | Path] = (),
+    success: Success = "any",
+) -> Report:
     """Writes the report of comparable runs.
+
+    Runs that know success are measured by their success rates, others by returns.
 
     Args:
         runs: run folders, complete or partial.
         out: the folder to write into; made where missing, an old report is replaced.
+        single: folders of finished runs that learn one task each, one for every task
+            of the sequence: forward transfer of success rates is measured from them.
+        success: which steps of an episode count: "any", or the "last" alone.
 
     Raises:
-        UserError: a run cannot be read, the runs are not comparable, or `out` cannot
-            be written.
+        UserError: a run cannot be read, the runs are not comparable, a task lacks its
+            single-task run, or `out` cannot be written.
     """
-    comparison = summarize([read_run(run) for run in runs])
+    known = ", ".join(SUCCESS)
+    require(success in SUCCESS, f"unknown success {success!r}: choose one of {known}")
+    comparison = summarize(
+        [read_run(run, success) for run in runs],
+        [read_run(run, success) for run in single],
+    )
     out = Path(out)
     report = Report(
         title=_title(comparison.summaries),
@@ -114,8 +138,9 @@ def write_report(runs: Sequence[str | Path], out: str | Path) -> Report:
         report.csv.write_text(tables.results_csv(comparison), encoding="utf-8")
         report.tasks.write_text(tables.tasks_csv(comparison), encoding="utf-8")
         report.json.write_text(_json(report), encoding="utf-8")
-        figures.curves(lines, first.tasks, budget, title, report.curves)
-        figures.matrices(lines, first.tasks, title, report.matrix)
+        score = comparison.score
+        figures.curves(lines, first.tasks, budget, score, title, report.curves)
+        figures.matrices(lines, first.tasks, score, title, report.matrix)
         points = [_point(summary) for summary in report.summaries]
         tradeoff(points, comparison.unit, title, report.tradeoff)
     except OSError as error:
@@ -164,11 +189,18 @@ def to_terminal(report: Report, width: int = 100) -> str:
 
 
 def _reading(comparison: Comparison) -> Iterator[str]:
-    yield _READING
-    if not comparison.raw:
+    score = comparison.score
+    reading = f"{score.evaluated} {_READING}"
+    if score.normalised:
+        yield f"{reading} Forgetting of single tasks is in returns."
+    else:
+        yield f"{reading} {_CONTINUAL_WORLD}"
+    if comparison.normalised:
         yield _NORMALISED
-    if comparison.sources:
-        yield _PAPER
+    if comparison.single:
+        yield _TRANSFER
+    for made in dict.fromkeys(source.made for source in comparison.sources):
+        yield f"The paper's columns are its published results, {made}."
 
 
 def heading(subject: str, settings: dict[str, Any], tasks: int, members: str) -> str:
@@ -183,10 +215,17 @@ def heading(subject: str, settings: dict[str, Any], tasks: int, members: str) ->
     budget, paper = int(settings["interactions"]), settings.get("paper_interactions")
     spec = SCENARIOS.get(settings["scenario"])
     whole = len(spec.changes) * spec.repeats if spec else tasks
+    count = "1 task" if tasks == 1 else f"{tasks} tasks"
+    rewards = []
+    if spec and spec.domain == "metaworld":
+        # Its tasks are not those of the version that the paper used.
+        subject = f"{subject} on Meta-World v3"
+        rewards = [f"reward {settings['reward']}"]
     parts = [
         f"{subject}: {settings['profile']} profile",
-        f"{tasks} of {whole} tasks" if tasks < whole else f"{tasks} tasks",
+        f"{tasks} of {whole} tasks" if tasks < whole else count,
         f"{budget:,} interactions a task",
+        *rewards,
         f"{settings['backend']} backend",
         members,
     ]
@@ -230,7 +269,7 @@ def _notes(comparison: Comparison) -> Iterator[str]:
 def _line(summary: Summary) -> figures.Line:
     run, kept = summary.run, summary.run.kept
     scores = np.concatenate([run.before[:, None], run.scores], axis=1)
-    curve = [(x, returns[kept]) for x, returns in run.curve]
+    curve = [(x, values[kept]) for x, values in run.curve]
     return figures.Line(summary.label, curve, scores[kept])
 
 
@@ -259,14 +298,17 @@ def _markdown(report: Report) -> str:
     ):
         lines += [f"![{name}]({path.name})", ""]
     lines += tables.markdown(*tables.tasks(comparison))
-    for summary in report.summaries:
-        run, made = summary.run, summary.run.provenance
-        seeds = ", ".join(str(seed) for seed in run.seeds)
-        facts = [f"{key} `{made.get(key)}`" for key in ("command", "commit", "started")]
-        lines.append(
-            f"- {summary.label}: `{run.folder}`, seeds {seeds}, {', '.join(facts)}"
-        )
+    lines += [_origin(summary.label, summary.run) for summary in report.summaries]
+    lines += [_origin(f"{run.tasks[0]} alone", run) for run in comparison.single]
     return "\n".join(lines) + "\n"
+
+
+def _origin(label: str, run: RunData) -> str:
+    seeds = ", ".join(str(seed) for seed in run.seeds)
+    facts = [
+        f"{key} `{run.provenance.get(key)}`" for key in ("command", "commit", "started")
+    ]
+    return f"- {label}: `{run.folder}`, seeds {seeds}, {', '.join(facts)}"
 
 
 def _json(report: Report) -> str:
@@ -282,11 +324,9 @@ def _json(report: Report) -> str:
             "diverged": summary.run.diverged,
             # The seeds whose `values` stand below, in their order.
             "kept": np.array(summary.run.seeds)[summary.run.kept].tolist(),
-            "tasks": [
-                {"name": name, **{key: asdict(value) for key, value in task.items()}}
-                for name, task in zip(summary.run.tasks, summary.tasks, strict=True)
-            ],
+            "tasks": _tasks_json(summary.run, summary.tasks),
             "scores": summary.run.scores[summary.run.kept].tolist(),
+            **_others_json(summary),
             "performance": asdict(summary.performance),
             "iqm": asdict(summary.iqm),
             "mean_forgetting": asdict(summary.forgetting),
@@ -311,4 +351,36 @@ def _json(report: Report) -> str:
         "unit": report.comparison.unit,
         "runs": runs,
     }
+    if report.comparison.single:
+        data["single"] = [
+            {
+                "task": run.tasks[0],
+                "folder": str(run.folder),
+                "seeds": run.seeds,
+                "settings": run.settings,
+                "provenance": run.provenance,
+            }
+            for run in report.comparison.single
+        ]
     return tables.json_text(data)
+
+
+def _tasks_json(run: RunData, tasks: Tasks) -> list[dict[str, Any]]:
+    return [
+        {"name": name, **{key: asdict(value) for key, value in task.items()}}
+        for name, task in zip(run.tasks, tasks, strict=True)
+    ]
+
+
+def _others_json(summary: Summary) -> dict[str, Any]:
+    """Scores that were measured beside the one of the report."""
+    run = summary.run
+    others = {
+        score.name: {
+            "tasks": _tasks_json(run, summary.others[score.name]),
+            "scores": values[run.kept, 1:].tolist(),
+        }
+        for score, values in run.measured.items()
+        if score != run.score
+    }
+    return {"others": others} if others else {}

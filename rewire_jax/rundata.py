@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rewire_jax.errors import UserError
 from rewire_jax.jsonlines import index, number, reason, table, text
+from rewire_jax.scores import RETURN, SCORES, SUCCESS, Score, Success
 
 Array = NDArray[np.float64]
 _NEEDED = ("scenario", "method", "profile", "backend", "interactions")
@@ -36,15 +37,17 @@ class RunData:
         provenance: command, commit, versions, device and start time.
         seeds: the S seeds that have results.
         diverged: those among them that were marked as diverged.
-        before: evaluation returns before any training, `[S, T]`, NaN where missing.
-        scores: evaluation returns `[S, T stages, T tasks]`, NaN where missing.
+        score: what the run is measured by.
+        measured: evaluations by each score there is, `[S, 1 + T stages, T tasks]`, NaN
+            where missing; the first of the stages is before any training.
         finished: number of leading stages that are evaluated for all tasks and seeds.
         model_size: numbers stored ÷ those of one policy, the maximum over the run.
         training: interactions spent on training, a seed.
         selection: interactions spent on choosing and rolling back, a seed.
         episode_length: steps to the time limit.
-        curve: per stage, interactions within the task `[points]` and what the training
-            reward a step makes in a whole episode, `[S, points]`; NaN where missing.
+        curve: per stage, interactions within the task `[points]` and the score of
+            training, `[S, points]`, NaN where missing; the return is what the reward
+            a step makes in a whole episode.
         hours: wall clock of training in all seeds together, with compilation, without
             selection and evaluation.
         rate: training interactions of all seeds per second, without the chunks that
@@ -58,8 +61,8 @@ class RunData:
     provenance: dict[str, Any]
     seeds: tuple[int, ...]
     diverged: tuple[int, ...]
-    before: Array
-    scores: Array
+    score: Score
+    measured: dict[Score, Array]
     finished: int
     model_size: float
     training: int
@@ -68,6 +71,16 @@ class RunData:
     curve: tuple[tuple[Array, Array], ...]
     hours: float
     rate: float | None
+
+    @property
+    def before(self) -> Array:
+        """Scores before any training, `[S, T]`, NaN where missing."""
+        return self.measured[self.score][:, 0]
+
+    @property
+    def scores(self) -> Array:
+        """Scores after each task's training, `[S, T stages, T tasks]`, in that way."""
+        return self.measured[self.score][:, 1:]
 
     @property
     def complete(self) -> bool:
@@ -80,7 +93,7 @@ class RunData:
         return np.array([seed not in self.diverged for seed in self.seeds], bool)
 
 
-def read_run(folder: str | Path) -> RunData:
+def read_run(folder: str | Path, success: Success = "any") -> RunData:
     """Reads a run from its folder alone.
 
     The last line of a table may have been cut by a crash and is then ignored. A row
@@ -89,6 +102,8 @@ def read_run(folder: str | Path) -> RunData:
     Args:
         folder: holds `settings.json`, `results.jsonl` and, once training has begun,
             `training.jsonl` and `timing.jsonl`.
+        success: which steps count where success is known, which is the score then;
+            elsewhere that is the return.
 
     Raises:
         UserError: a file is missing, or damaged elsewhere than in its last line.
@@ -101,17 +116,22 @@ def read_run(folder: str | Path) -> RunData:
         raise UserError(f"{folder / 'results.jsonl'} holds no results yet")
     seeds = sorted({seed for _, _, seed in results})
     place = {seed: i for i, seed in enumerate(seeds)}
-    # One row of `everything` more than there are stages: the first is "before".
-    everything = np.full((len(seeds), len(tasks) + 1, len(tasks)), np.nan)
-    seen = np.zeros(everything.shape, bool)
+    known = {name for row in results.values() for name in row}
+    shape = len(seeds), len(tasks) + 1, len(tasks)
+    measured = {s: np.full(shape, np.nan) for s in SCORES if s.name in known}
+    score = SUCCESS[success] if SUCCESS[success] in measured else RETURN
+    seen = np.zeros(shape, bool)
     for (stage, task, seed), row in results.items():
-        everything[place[seed], stage + 1, task] = row["return"]
-        seen[place[seed], stage + 1, task] = True
+        at = place[seed], stage + 1, task
+        seen[at] = True
+        for each, values in measured.items():
+            values[at] = row.get(each.name, np.nan)
     whole = seen.all(axis=(0, 2))
     finished = int(np.cumprod(whole)[1:].sum())
     spent = [row["interactions"] for row in results.values()]
     began = finished > 0
-    rewards = _curve(folder, len(tasks), place, began, "reward")
+    trained = _curve(folder, len(tasks), place, began, score.training)
+    steps = head.episode_length if score.stepwise else 1
     hours, rate = times(folder / "timing.jsonl", len(tasks), len(seeds), began)
     return RunData(
         folder=folder,
@@ -120,15 +140,15 @@ def read_run(folder: str | Path) -> RunData:
         provenance=head.provenance,
         seeds=tuple(seeds),
         diverged=tuple(sorted({k[2] for k, row in results.items() if row["diverged"]})),
-        before=everything[:, 0],
-        scores=everything[:, 1:],
+        score=score,
+        measured=measured,
         finished=finished,
         model_size=max(row["model_size"] for row in results.values()),
         # Equal for all seeds but those that stopped early because they diverged.
         training=max(training for training, _ in spent),
         selection=max(selection for _, selection in spent),
         episode_length=head.episode_length,
-        curve=tuple((x, values * head.episode_length) for x, values in rewards),
+        curve=tuple((x, values * steps) for x, values in trained),
         hours=hours,
         rate=rate,
     )
@@ -171,8 +191,10 @@ def result(row: dict[str, Any], tasks: int) -> tuple[tuple[int, ...], dict[str, 
     """Key (stage, task, seed) and checked values of a row of `results.jsonl`."""
     stage, task = index(row, "stage", -1, tasks), index(row, "task", 0, tasks)
     spent = row["interactions"]
+    rates = {each.name: row[each.name] for each in SUCCESS.values() if each.name in row}
     return (stage, task, int(row["seed"])), {
         "return": number(row["return"]),
+        **{name: number(rate) for name, rate in rates.items()},
         "diverged": bool(row["diverged"]),
         "model_size": float(row["model_size"]),
         "interactions": (int(spent["training"]), int(spent["selection"])),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from rewire_jax.figures import number
 from rewire_jax.published import Figures
-from rewire_jax.summary import MEASURES, Comparison, Interval, Spread, Summary
+from rewire_jax.summary import Comparison, Interval, Spread, Summary
 
 # Columns of words are set to the left, all others to the right.
 WORDS = frozenset(("method", "task", "seeds", "device"))
@@ -23,15 +23,16 @@ class Table(NamedTuple):
 
 
 def tasks(comparison: Comparison) -> Table:
-    """A row for each run and task, of returns; tasks count from 1."""
+    """A row for each run and task, not normalised; tasks count from 1."""
+    measures = comparison.measures
     rows = [
-        [summary.label, f"{k} {name}", *map(spread, task.values())]
+        [summary.label, f"{k} {name}", *(spread(task[measure]) for measure in measures)]
         for summary in comparison.summaries
         for k, (name, task) in enumerate(
             zip(summary.run.tasks, summary.tasks, strict=True), 1
         )
     ]
-    return Table(("method", "task", *MEASURES.values()), rows)
+    return Table(("method", "task", *measures.values()), rows)
 
 
 def results(comparison: Comparison) -> Table:
@@ -43,7 +44,7 @@ def results(comparison: Comparison) -> Table:
         "model size",
     ]
     for source in comparison.sources:
-        heads.append(f"paper's {source.table}, {source.name} (÷ SAC-N)")
+        heads.append(f"paper's {source.table}, {source.name} ({source.unit})")
         if source.sized:
             heads.append("its model size")
     rows = []
@@ -64,11 +65,12 @@ def results(comparison: Comparison) -> Table:
 
 def costs(comparison: Comparison) -> Table:
     """A row for each run: what was forgotten, what was of use, what it took."""
+    transferred = comparison.transferred
     rows = [
         [
             summary.label,
             spread(summary.forgetting),
-            spread(summary.transfer),
+            *([spread(summary.transfer)] if transferred else []),
             f"{summary.run.training:,}",
             f"{summary.run.selection:,}",
             number(summary.run.hours),
@@ -80,7 +82,7 @@ def costs(comparison: Comparison) -> Table:
     heads = (
         "method",
         "forgetting",
-        "forward transfer",
+        *(["forward transfer"] if transferred else []),
         "training",
         "selection",
         "hours, all seeds together",
@@ -102,7 +104,11 @@ def results_csv(comparison: Comparison) -> str:
                 "iqm_high": summary.iqm.high,
             }
             | columns("forgetting", summary.forgetting)
-            | columns("forward_transfer", summary.transfer)
+            | (
+                columns("forward_transfer", summary.transfer)
+                if comparison.transferred
+                else {}
+            )
             | run_values(summary)
             | {
                 f"paper_{source.key}_{key}": getattr(theirs, key, None)
@@ -118,21 +124,22 @@ def results_csv(comparison: Comparison) -> str:
 
 
 def tasks_csv(comparison: Comparison) -> str:
-    """CSV with a row for each run and task, of returns; tasks count from 1."""
-    return csv_text(
-        [
-            {"method": summary.label, "task": k, "name": name}
-            | {
-                column: value
-                for measure, over in task.items()
-                for column, value in columns(measure, over).items()
-            }
-            for summary in comparison.summaries
-            for k, (name, task) in enumerate(
-                zip(summary.run.tasks, summary.tasks, strict=True), 1
-            )
-        ]
-    )
+    """CSV with a row for each run and task, not normalised; tasks count from 1.
+
+    Where several scores were measured, a column says which is the one without a prefix.
+    """
+    rows = []
+    for summary in comparison.summaries:
+        for k, name in enumerate(summary.run.tasks):
+            row = {"method": summary.label, "task": k + 1, "name": name}
+            if summary.others:
+                row["score"] = comparison.score.name
+            for prefix, tasks in {"": summary.tasks, **summary.others}.items():
+                for measure, value in tasks[k].items():
+                    column = f"{prefix}_{measure}" if prefix else measure
+                    row |= columns(column, value)
+            rows.append(row)
+    return csv_text(rows)
 
 
 def run_values(summary: Summary) -> dict[str, Any]:

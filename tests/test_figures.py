@@ -7,6 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from rewire_jax import figures
+from rewire_jax.scores import RETURN
 
 
 def test_nine_methods_have_nine_colours_and_more_have_other_lines() -> None:
@@ -41,12 +42,12 @@ def test_maps_of_any_number_of_methods(tmp_path: Path, count: int) -> None:
     scores = np.arange(6.0).reshape(1, 3, 2)
     lines = [figures.Line(f"method {i}", [], scores + i) for i in range(count)]
     path = tmp_path / "matrix.png"
-    figures.matrices(lines, ("one", "two"), "title", path)
+    figures.matrices(lines, ("one", "two"), RETURN, "title", path)
     image = imread(path)[..., :3]
     # Every method's frames are there, two a map.
     orange = np.abs(image - [0.835, 0.369, 0]).max(axis=2) < 0.02
     single = tmp_path / "single.png"
-    figures.matrices(lines[:1], ("one", "two"), "title", single)
+    figures.matrices(lines[:1], ("one", "two"), RETURN, "title", single)
     first = np.abs(imread(single)[..., :3] - [0.835, 0.369, 0]).max(axis=2) < 0.02
     assert orange.sum() > 0.3 * count * first.sum() > 0
 
@@ -59,7 +60,7 @@ def test_curves_start_anew_at_each_task(tmp_path: Path) -> None:
     for k, stages in enumerate(([high, low], [high, missing], [missing, missing])):
         line = figures.Line("one", [(x, r) for r in stages], np.zeros((2, 3, 2)))
         path = tmp_path / f"{k}.png"
-        figures.curves([line], ("one", "two"), 100, "title", path)
+        figures.curves([line], ("one", "two"), 100, RETURN, "title", path)
         image = imread(path)[..., :3]
         blue = np.abs(image - [0, 0.447, 0.698]).max(axis=2) < 0.02
         pictures.append(blue[:, : int(0.8 * blue.shape[1])].sum())  # no legend

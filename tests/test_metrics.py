@@ -72,6 +72,32 @@ def test_the_reference_is_one_without_transfer_or_ties_broken() -> None:
     np.testing.assert_array_equal(metrics.forgetting(ties), np.zeros((2, 3)))
 
 
+def test_area_weights_reports_by_the_interactions_since_the_last() -> None:
+    # 100 interactions at 0.2, 300 at 0.6, 100 at 1: by hand (20 + 180 + 100) / 500.
+    at = [100, 400, 500]
+    assert metrics.area(at, [0.2, 0.6, 1.0]) == pytest.approx(0.6)
+    # A report that saw no episode has no part in it, nor have its interactions.
+    seen = [[0.2, np.nan, 1.0], [np.nan, 0.6, 1.0], [np.nan] * 3, [0.5] * 3]
+    np.testing.assert_allclose(metrics.area(at, seen), [0.6, 0.7, np.nan, 0.5])
+    # However finely it is reported, a step curve has the same area.
+    fine = np.arange(1, 501)
+    steps = np.where(fine <= 100, 0.2, np.where(fine <= 400, 0.6, 1.0))
+    assert metrics.area(fine, steps) == pytest.approx(0.6)
+    assert np.isnan(metrics.area([], []))
+
+
+def test_known_transfer_by_area() -> None:
+    alone = [0.5, 0.8, 0.0, 1.0]
+    areas = [[0.75, 0.8, 0.3, 1.0], [1.0, 0.6, 0.0, 0.9]]
+    np.testing.assert_allclose(
+        metrics.area_transfer(areas, alone),
+        [[0.5, 0.0, 0.3, np.nan], [1.0, -1.0, 0.0, np.nan]],
+    )
+    np.testing.assert_array_equal(
+        metrics.area_transfer([0.5, np.nan], [np.nan, 0.5]), [np.nan, np.nan]
+    )
+
+
 @pytest.mark.parametrize(
     ("values", "middle"),
     [
