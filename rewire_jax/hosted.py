@@ -214,10 +214,10 @@ def _chunk(
             if colored and (sequence is None or now % environment.episode_length == 0):
                 sequence = functions.sequence(members, index, now)
             seen = episodes.state.observation
-            action, label = functions.act(
+            drawn, label = functions.act(
                 members, acting, label, seen, episodes.steps, index, now, sequence
             )
-            action = np.asarray(action)
+            action = np.asarray(drawn)
             episodes, step = _advance(environment, lanes, task, roots, episodes, action)
             played.append((action, jax.tree.map(np.asarray, label), step))
         along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)

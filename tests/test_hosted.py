@@ -1,0 +1,324 @@
+import dataclasses
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rewire_jax import continual, hosted, training
+from rewire_jax.config import Settings
+from rewire_jax.envs.base import HostEnvironment
+from rewire_jax.errors import UserError
+from rewire_jax.lanes import Lanes, open_lanes
+from rewire_jax.methods import find_method
+from rewire_jax.plan import Plan, prepare
+from rewire_jax.presets import preset
+from tests import walk
+
+EVERY = 4
+
+
+@pytest.fixture(autouse=True)
+def one_core(monkeypatch):
+    """Simulators are made quickly where they share this process."""
+    monkeypatch.setattr("rewire_jax.lanes._cores", lambda: 1)
+
+
+def settings(method: str = "ft1", **changes) -> Settings:
+    quick = preset(walk.scenario(walk.COMPILED), method, "quick")
+    shape = {
+        "interactions": 160,
+        "envs": 1,
+        "updates": 3,
+        "update_every": EVERY,
+        "warmup": 6,
+        "random_interactions": 5,
+        "eval_episodes": 3,
+        "selection_episodes": 1,
+        "report_every": 40,
+        "checkpoint_every": 0,
+    }
+    sac = dataclasses.replace(quick.sac, hidden=12, depth=1, batch_size=8)
+    return dataclasses.replace(quick, sac=sac, **(shape | changes))
+
+
+def planned(environment=None, method="ft1", **changes) -> Plan:
+    environment = environment or walk.walker()
+    return prepare(settings(method, **changes), walk.scenario(environment))
+
+
+def begin(plan: Plan, index=0):
+    alive = np.ones(plan.places, bool)
+    learner = plan.program.init(plan.members)
+    return plan.program.begin(plan.members, learner, alive, index, walk.TASKS[index])
+
+
+def go(plan: Plan, state, chunks, time=0, index=0):
+    """The state after the chunks, and their reports; `state` survives."""
+    state = jax.tree.map(jnp.copy, state)
+    reports = []
+    for steps in chunks:
+        state, report = plan.program.chunk(
+            plan.members, state, index, walk.TASKS[index], time, steps
+        )
+        time += steps
+        reports.append(jax.tree.map(np.asarray, report))
+    return state, reports
+
+
+def close(one, other):
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5), one, other
+    )
+
+
+def equal(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+@pytest.mark.parametrize(
+    ("method", "color"), [("ft1", 0.0), ("ft1", 1.0), ("rewire", 0.0), ("csp", 0.0)]
+)
+def test_the_loop_does_what_the_compiled_one_does(method, color):
+    made = settings(method, interactions=400)
+    made = dataclasses.replace(
+        made, sac=dataclasses.replace(made.sac, noise_color=color)
+    )
+    plans = [
+        prepare(made, walk.scenario(environment))
+        for environment in (walk.walker(), walk.COMPILED)
+    ]
+    results = [go(plan, begin(plan, 1), [20, 32], index=1) for plan in plans]
+    (ours, ours_reports), (theirs, theirs_reports) = results
+    close(ours.learner, theirs.learner)
+    close(ours.collection.buffer, theirs.collection.buffer)
+    close(ours.collection.label, theirs.collection.label)
+    close(ours_reports, theirs_reports)
+    assert ours_reports[1].updates == 8
+    assert ours_reports[1].episodes >= 2
+    assert abs(ours.collection.buffer.reward).sum() > 1
+    for plan, (state, _) in zip(plans, results, strict=True):
+        expected = plan.program.expect(
+            plan.members,
+            jax.eval_shape(plan.program.init, plan.members),
+            np.ones(1, bool),
+            0,
+            walk.TASKS[0],
+        )
+        shapes = jax.tree.map(lambda x: (x.shape, x.dtype), (state, expected))
+        assert shapes[0] == shapes[1]
+
+
+def test_lanes_in_processes_do_what_one_process_does(monkeypatch):
+    several = planned(walk.walker(0.5), envs=2, warmup=12)
+    results = []
+    for cores in (1, 2):
+        monkeypatch.setattr("rewire_jax.lanes._cores", lambda cores=cores: cores)
+        open_lanes.cache_clear()
+        results.append(go(several, begin(several), [16, 8]))
+    equal(*results)
+    open_lanes.cache_clear()
+
+
+def test_a_member_does_what_it_would_do_alone():
+    environment = walk.walker(0.5)
+    crowd = planned(environment, seeds=2)
+    together, _ = go(crowd, begin(crowd), [40])
+    alone = planned(environment, seed=1)
+    state, _ = go(alone, begin(alone), [40])
+    close(jax.tree.map(lambda x: x[1:], together.learner), state.learner)
+    close(
+        jax.tree.map(lambda x: x[1:], together.collection.buffer),
+        state.collection.buffer,
+    )
+
+
+@pytest.mark.parametrize("overlap", [False, True])
+def test_chunks_do_not_matter_nor_what_was_played_between(overlap):
+    plan = planned(walk.walker(0.5), overlap=overlap)
+    start = begin(plan)
+    whole, (report,) = go(plan, start, [48])
+    begin(plan)  # the simulators start anew
+    first, reports = go(plan, start, [20])
+    # Eight steps into an episode; now something else is played, then other simulators.
+    assert first.collection.episodes.steps == 8
+    policies = plan.program.policies(plan.members, first.learner)
+    keys = jax.random.split(jax.random.key(3), (1, 2))
+    plan.program.rollout(plan.tasks, policies, keys, 2)
+    second, more = go(plan, first, [20], time=20)
+    open_lanes.cache_clear()
+    third, last = go(plan, second, [8], time=40)
+    equal(whole, third)
+    episodes = sum(r.episodes for r in [*reports, *more, *last])
+    assert episodes == report.episodes == 4
+    np.testing.assert_allclose(
+        sum(r.returns for r in [*reports, *more, *last]), report.returns, rtol=1e-5
+    )
+
+
+def test_environments_that_end_apart_are_recalled():
+    plan = planned(walk.walker(0.9), envs=3, warmup=12)
+    start = begin(plan)
+    whole, _ = go(plan, start, [8, 8, 8])
+    state, _ = go(plan, start, [8, 8])
+    assert len(set(state.collection.episodes.steps.ravel().tolist())) > 1
+    open_lanes.cache_clear()
+    state, _ = go(plan, state, [8], time=16)
+    equal(whole, state)
+
+
+def test_a_simulator_that_does_not_repeat_itself_is_told():
+    plan = planned(walk.walker(0.5, noise=1e-3))
+    state, _ = go(plan, begin(plan), [8])
+    open_lanes.cache_clear()
+    with pytest.raises(UserError, match="does not repeat the episode"):
+        go(plan, state, [4], time=8)
+
+
+def test_every_episode_has_a_start_of_its_own():
+    plan = planned(walk.walker(0.5))
+    state, _ = go(plan, begin(plan), [40])
+    buffer = jax.tree.map(lambda x: np.asarray(x)[0, :, 0], state.collection.buffer)
+    seen = buffer.observation[:41]
+    starts = seen[1:][(buffer.truncated | buffer.terminal)[:40]]
+    assert len(starts) >= 3
+    assert len(np.unique(starts, axis=0)) == len(starts)
+    other = planned(walk.walker(0.5), seed=1)
+    assert (begin(other).collection.buffer.observation[0, 0] != seen[0]).all()
+    later = begin(plan, 1)
+    assert (later.collection.buffer.observation[0, 0] != seen[0]).all()
+
+
+def test_with_overlap_the_policy_before_the_last_updates_acts():
+    plan = planned(walk.walker(0.5), overlap=True, random_interactions=0)
+    states = [begin(plan)]
+    for number in range(5):
+        state, _ = go(plan, states[-1], [EVERY], time=EVERY * number)
+        states.append(state)
+    final = states[-1].collection.buffer
+    member = jax.tree.map(lambda x: x[0], plan.members)
+    key = jax.random.split(jax.random.fold_in(jax.random.fold_in(member.keys, 1), 0), 4)
+    method = find_method("ft1").make(plan.spec, plan.settings.options)
+
+    def acted(learner, time):
+        action, _ = training.explore(
+            jax.random.split(jax.random.fold_in(key[1], time))[0],
+            jax.tree.map(lambda x: x[0], (learner.params, learner.memory)),
+            (),
+            final.observation[0, time],
+            jnp.zeros(1, jnp.int32),
+            jnp.asarray(time),
+            method,
+            training.Shape(1, 1, 0, 0, 1),
+            None,
+        )
+        return action
+
+    for number in (2, 3, 4):
+        time = EVERY * number
+        before, newest = states[number - 1].learner, states[number].learner
+        mine = final.action[0, time]
+        np.testing.assert_allclose(acted(before, time), mine, rtol=1e-4, atol=1e-5)
+        if number > 2:  # by then there were updates between the two
+            assert abs(acted(newest, time) - mine).max() > 1e-4
+    plain = planned(walk.walker(0.5), random_interactions=0)
+    state, _ = go(plain, begin(plain), [5 * EVERY])
+    assert (state.collection.buffer.action[0, 16:20] != final.action[0, 16:20]).any()
+
+
+def test_rollouts_are_those_of_a_loop():
+    environment = walk.walker(0.9)
+    plan = planned(environment, seeds=2, seed=4)
+    learner = plan.program.init(plan.members)
+    # Policies that reach the goals, and run over the edge on the way to some.
+    policies = plan.program.policies(plan.members, learner)
+    policies = jax.tree.map(lambda x: 4 * x, policies)
+    keys = jax.random.split(jax.random.key(5), (2, 2))
+    count = 5  # for two lanes: the last wave has one to spare
+    result = plan.program.rollout(plan.tasks, policies, keys, count)
+    method = find_method("ft1").make(plan.spec, plan.settings.options)
+    simulator = environment.make()
+    for m, row, e in itertools.product(range(2), range(2), range(count)):
+        task = walk.TASKS[row]
+        words = [*np.asarray(jax.random.key_data(keys[m, row])), e]
+        seed = int(np.random.SeedSequence(words).generate_state(1)[0])
+        seen, _ = simulator.reset(seed=seed, options={"task": row})
+        policy = jax.tree.map(lambda x, m=m, row=row: x[m, row], policies)
+        total, solved, terminal, steps = 0.0, [], False, 0
+        while steps < walk.LENGTH and not terminal:
+            mean, _ = method.act(policy, seen * task.observation_mask)
+            action = np.asarray(jnp.tanh(mean) * task.action_scale)
+            seen, reward, terminal, _, info = simulator.step(action)
+            total, steps = total + reward, steps + 1
+            solved.append(info["success"])
+        at = m, row, e
+        np.testing.assert_allclose(result.returns[at], total, rtol=1e-4)
+        assert result.lengths[at] == steps
+        assert result.success.any[at] == any(solved)
+        assert result.success.last[at] == solved[-1]
+    assert 0 < result.success.any.sum() < result.success.any.size
+    assert (result.lengths < walk.LENGTH).any()
+
+
+def test_a_run_tells_of_success(tmp_path):
+    made = settings(interactions=160)
+    folder = continual.train(
+        made, tmp_path / "run", scenario=walk.scenario(walk.walker(0.5))
+    )
+    rows = [json.loads(x) for x in (folder / "results.jsonl").read_text().splitlines()]
+    assert len(rows) == 3 * 2
+    assert all(0 <= row["success_last"] <= row["success"] <= 1 for row in rows)
+    table = (folder / "training.jsonl").read_text().splitlines()
+    reports = [json.loads(line) for line in table]
+    assert [row["interactions"] for row in reports] == [40, 80, 120, 160] * 2
+    assert all("success" in row and "success_last" in row for row in reports)
+
+
+def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():
+    plan = planned(walk.walker(0.9), interactions=400)
+    state, (report,) = go(plan, begin(plan), [96])
+    buffer = jax.tree.map(lambda x: np.asarray(x)[0, :, 0], state.collection.buffer)
+    solved = -buffer.reward[:96] < 0.09
+    ended = (buffer.terminal | buffer.truncated)[:96]
+    episodes = np.split(solved, np.flatnonzero(ended) + 1)[: ended.sum()]
+    assert report.episodes == len(episodes)
+    assert report.successes.any == sum(e.any() for e in episodes)
+    assert report.successes.last == sum(e[-1] for e in episodes)
+    assert 0 < report.successes.any < len(episodes)
+
+
+def test_updates_follow_every_so_many_steps():
+    shape = training.Shape(1, updates=7, warmup=10, random=0, transitions=9, every=4)
+    due = [steps for steps in range(1, 30) if shape.due(steps)]
+    assert due == [12, 16, 20, 24, 28]
+    assert [shape.before(steps) for steps in due] == [0, 7, 14, 21, 28]
+    plan = planned(interactions=163)
+    assert plan.steps == 160  # a task ends with updates
+
+
+def test_overlap_needs_something_to_overlap():
+    with pytest.raises(UserError, match="--overlap"):
+        planned(walk.COMPILED, overlap=True)
+
+
+def test_seeds_are_told_apart():
+    roots = np.array([[0, 1], [0, 2]], np.uint32)
+    drawn = hosted._seeds(roots, np.array([[0, 0, 1], [0, 5, 1]]))
+    assert drawn.shape == (2, 3)
+    assert len(np.unique(drawn)) == 6
+    np.testing.assert_array_equal(
+        drawn, hosted._seeds(roots, np.array([[0, 0, 1], [0, 5, 1]]))
+    )
+
+
+def test_lanes_that_are_not_reset_go_on():
+    lanes = Lanes(walk.walker(0.5), 1)
+    lanes.reset(0, [4])
+    first = lanes.step(np.zeros((1, 2), np.float32))
+    assert isinstance(walk.walker(), HostEnvironment)
+    np.testing.assert_array_equal(lanes.observation, first.observation)
+    assert lanes.steps == 1
+    lanes.reset(1, [9])
+    assert (lanes.task, lanes.steps[0], lanes.seeds[0]) == (1, 0, 9)
