@@ -22,11 +22,12 @@ option = $(if $(strip $(2)),--$(1) $(2))
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup setup-mjx lock lock-mjx lint format test test-slow test-mjx \
-	bench-brax bench-speed bench-mjx readme clean
+	bench-brax bench-cw bench-speed bench-mjx readme clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
-	@echo 'bench-brax reads SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS BACKEND OUT KEEP where set.'
+	@echo 'bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS TASKS' \
+		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too.'
 
 setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
 
@@ -91,17 +92,25 @@ test-slow: setup ## Run the slow tests
 test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (compiles for minutes at first)
 	$(RUN) -m pytest tests/test_metaworld_mjx.py
 
+bench_options = $(strip \
+	$(call option,scenario,$(SCENARIO)) \
+	$(call option,methods,$(subst $(comma), ,$(METHODS))) \
+	$(call option,profile,$(PROFILE)) \
+	$(call option,seeds,$(SEEDS)) \
+	$(call option,seed,$(SEED)) \
+	$(call option,interactions,$(INTERACTIONS)) \
+	$(call option,tasks,$(TASKS)) \
+	$(call option,backend,$(BACKEND)) \
+	$(call option,out,$(OUT)) \
+	$(if $(KEEP),--keep))
+
 bench-brax: setup ## Run the methods on a Brax scenario, make its table and figures
-	$(RUN) -m experiments.bench_brax $(strip \
-		$(call option,scenario,$(SCENARIO)) \
-		$(call option,methods,$(subst $(comma), ,$(METHODS))) \
-		$(call option,profile,$(PROFILE)) \
-		$(call option,seeds,$(SEEDS)) \
-		$(call option,seed,$(SEED)) \
-		$(call option,interactions,$(INTERACTIONS)) \
-		$(call option,backend,$(BACKEND)) \
-		$(call option,out,$(OUT)) \
-		$(if $(KEEP),--keep))
+	$(RUN) -m experiments.bench_brax $(bench_options)
+
+bench-cw: setup ## The same on a Continual World scenario (TRANSFER=1: and each task alone)
+	$(RUN) -m experiments.bench_cw $(strip $(bench_options) \
+		$(call option,reward,$(REWARD)) \
+		$(if $(TRANSFER),--transfer))
 
 bench-speed: setup ## Measure interactions and updates a second
 	$(RUN) -m experiments.bench_speed

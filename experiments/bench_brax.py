@@ -4,11 +4,14 @@ Run by `make bench-brax`. A method whose run is finished is not run again, and o
 that was stopped goes on, so the same command can be given until all is done.
 """
 
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import rewire_jax
 from experiments import suite
+from rewire_jax.config import require
 from rewire_jax.methods import METHODS
 from rewire_jax.report import to_terminal
 
@@ -30,8 +33,13 @@ class Bench(suite.Job):
     keep: bool = False
 
 
-def run(bench: Bench) -> None:
+def run(bench: Bench, single: Sequence[suite.Run] = ()) -> None:
     """Trains each method where that is not done, and reports on all.
+
+    Args:
+      bench: what to run.
+      single: runs of one task each, from which forward transfer is measured once all
+        of them are finished.
 
     Raises:
       UserError: wrong arguments.
@@ -39,13 +47,19 @@ def run(bench: Bench) -> None:
     """
     name = bench.name(bench.scenario)
     out = bench.out or Path("runs") / name
-    scenario = rewire_jax.make_scenario(bench.scenario, bench.backend)
+    scenario = bench.scenario_of(bench.scenario)
     methods = METHODS if "all" in bench.methods else dict.fromkeys(bench.methods)
     runs = [bench.run(scenario, method, out / method) for method in methods]
-    folders = [run.folder for run in suite.train(runs, bench)]
-    print(to_terminal(rewire_jax.write_report(folders, out)))
+    done = suite.train([*runs, *single], bench)
+    folders = [run.folder for run in runs if run in done]
+    require(bool(folders), "none of the methods has results yet")
+    alone = [run.folder for run in single if run.finished]
+    if len(alone) < len(single):
+        print("no forward transfer before all single-task runs end", file=sys.stderr)
+        alone = []
+    print(to_terminal(rewire_jax.write_report(folders, out, single=alone)))
     if bench.keep:
-        rewire_jax.write_report(folders, suite.RESULTS / name)
+        rewire_jax.write_report(folders, suite.RESULTS / name, single=alone)
     for folder in folders:
         print(f"checkpoints: {folder / 'checkpoints'}")
 

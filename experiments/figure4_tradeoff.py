@@ -27,7 +27,7 @@ class Figure4(suite.Experiment):
 
 def variants(job: Figure4, name: str) -> suite.Variants:
     """Methods and their options by the name of the run."""
-    scenario = rewire_jax.make_scenario(name, job.backend)
+    scenario = job.scenario_of(name)
     chosen: suite.Variants = {method: (method, {}) for method in published.NAMES}
     for label, (method, factor) in SIZED.items():
         hidden = rewire_jax.preset(scenario, method, job.profile).sac.hidden

@@ -55,7 +55,7 @@ def run(job: Figure6) -> None:
       UserError: wrong arguments.
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
-    scenario = rewire_jax.make_scenario(job.scenario, job.backend)
+    scenario = job.scenario_of(job.scenario)
     what = "figure6-grid" if job.full else "figure6-lines"
     folder = job.out / job.name(job.scenario) / what
     made = job.run(scenario, "rewire", folder)

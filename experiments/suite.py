@@ -22,6 +22,7 @@ from rewire_jax.published import Figures
 from rewire_jax.report import Report
 from rewire_jax.rundata import RunData, read_run
 from rewire_jax.runfolder import HEADER, TABLES, compare, provenance
+from rewire_jax.scores import Success
 from rewire_jax.summary import Summary
 from rewire_jax.tables import csv_text, json_text
 
@@ -30,12 +31,15 @@ Variants = dict[str, tuple[str, dict[str, Any]]]
 """Methods and some of their options, SAC's among them, by the name of the run."""
 
 RESULTS = Path("experiments/results")
+AVERAGED = (
+    "that of several scenarios is the mean over them, of means and of standard "
+    "deviations over seeds. Runs that are not finished have no part in it. Model size "
+    "is in plain policies."
+)
 READING = (
     "Performance is the return at the end, averaged over tasks, divided by that of "
-    "SAC-N; that of several scenarios is the mean over them, of means and of standard "
-    "deviations over seeds. Runs that are not finished have no part in it. Model size "
-    "is in plain policies. The paper's results were made with Brax v1, whose physics "
-    "is another."
+    f"SAC-N; {AVERAGED} The paper's results were made with Brax v1, whose physics is "
+    "another."
 )
 _KINDS = ("forgetting", "transfer", "robustness", "compositionality")
 DOMAINS = {
@@ -55,7 +59,8 @@ class Job:
       seed: of the first member.
       interactions: of training for each task; 0 takes the profile's.
       tasks: of the sequence that are trained; 0 takes the profile's number.
-      backend: physics backend.
+      backend: physics backend; the domain's first if None.
+      reward: version of Meta-World's rewards; elsewhere it changes nothing.
       train: otherwise report on the runs that there are, as far as they have come.
     """
 
@@ -64,7 +69,8 @@ class Job:
     seed: int = 0
     interactions: int = 0
     tasks: int = 0
-    backend: str = "positional"
+    backend: str | None = None
+    reward: str = "v2"
     train: bool = True
 
     def name(self, what: str) -> str:
@@ -72,6 +78,10 @@ class Job:
         name = f"{what.replace('/', '-')}-{self.profile}"
         name += f"-{self.interactions}" if self.interactions else ""
         return name + (f"-tasks-{self.tasks}" if self.tasks else "")
+
+    def scenario_of(self, name: str) -> rewire_jax.Scenario:
+        """A scenario with this backend and reward."""
+        return rewire_jax.make_scenario(name, self.backend, self.reward)
 
     def run(
         self,
@@ -113,7 +123,7 @@ class Experiment(Job):
 
     def runs(self, scenario: str, variants: Variants) -> list["Run"]:
         """The runs on one scenario."""
-        made = rewire_jax.make_scenario(scenario, self.backend)
+        made = self.scenario_of(scenario)
         folder = self.out / self.name(scenario)
         return [
             self.run(made, method, folder / name, **options)
@@ -176,20 +186,30 @@ def train(runs: Sequence[Run], job: Job) -> list[Run]:
     return evaluated
 
 
-def reports(runs: Sequence[Run], out: Path) -> list[Report]:
-    """Writes a report for each scenario into a folder of its own."""
+def reports(runs: Sequence[Run], out: Path, success: Success = "any") -> list[Report]:
+    """Writes a report for each scenario into a folder of its own.
+
+    Args:
+      runs: that have results.
+      out: for the folders.
+      success: see `rewire_jax.write_report`.
+    """
     folders: dict[str, list[Path]] = {}
     for run in runs:
         name = run.settings.scenario.replace("/", "-")
         folders.setdefault(name, []).append(run.folder)
-    return [rewire_jax.write_report(each, out / name) for name, each in folders.items()]
+    return [
+        rewire_jax.write_report(each, out / name, success=success)
+        for name, each in folders.items()
+    ]
 
 
 class Average(NamedTuple):
     """What the runs of a name have in common.
 
     Attributes:
-      mean: performance ÷ SAC-N's, the mean over scenarios of that over seeds.
+      mean: performance in its reports' unit, the mean over scenarios of that over
+        seeds.
       std: the mean over scenarios of the standard deviation over seeds; None with a
         single seed.
       size: model size, the mean over scenarios.
@@ -205,7 +225,8 @@ class Average(NamedTuple):
 def averages(made: Sequence[Report]) -> dict[str, Average]:
     """Averages over scenarios by name of the run's folder.
 
-    Runs that are not finished, or that no SAC-N run normalises, have no part in them.
+    Runs that are not finished, or that no SAC-N run normalises where one should, have
+    no part in them.
     """
     found: dict[str, list[Summary]] = {}
     for report in made:

@@ -36,7 +36,7 @@ class Table3(suite.Experiment):
 
 def variants(job: Table3) -> suite.Variants:
     """Methods and their options by the name of the run."""
-    scenario = rewire_jax.make_scenario(job.scenario, job.backend)
+    scenario = job.scenario_of(job.scenario)
     plain = rewire_jax.preset(scenario, "ft_l2", job.profile).options
     unaligned = {"alignment": "off", "beta": plain.coefficient}
     single = {"modes": 1}

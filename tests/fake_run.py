@@ -36,7 +36,7 @@ def write_run(
     learning: np.ndarray = LEARNING,
     **settings: Any,
 ) -> Path:
-    """A run folder with `stages` tasks trained; with `rates`, one that knows success."""
+    """A run folder with `stages` tasks trained, with `rates` one that knows success."""
 
     def success(rate: float, seed: int) -> dict[str, float | None]:
         if rates is None:

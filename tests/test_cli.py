@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from fake_run import TRIPLET, write_alone, write_cw
 
 from rewire_jax import checkpoint, cli
 from rewire_jax.runfolder import HEADER
@@ -145,6 +146,22 @@ def test_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         assert (out / name).stat().st_size > 0
         assert str(out / name) in shown
     assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_report_of_success_rates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_cw(tmp_path / "run")
+    single = [str(write_alone(tmp_path / t, t, [0, 0, 0])) for t in TRIPLET]
+    words = ["report", str(run), "--out", str(tmp_path / "out")]
+    cli.main([*words, "--success", "last", "--single", *single])
+    shown = capsys.readouterr().out
+    # Half of (0.4 + 0.5 + 0.7) / 3 and of what the second seed solves above it.
+    assert "0.29 ± 0.04" in shown
+    assert "solved at their last step" in shown
+    assert "AUC_b" in shown
+    assert "no single-task run of" in fails(capsys, *words, "--single", single[0])
+    assert "--success" in fails(capsys, *words, "--success", "first")
 
 
 def test_reports_that_cannot_be(

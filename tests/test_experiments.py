@@ -11,22 +11,26 @@ import pytest
 import rewire_jax
 from experiments import (
     bench_brax,
+    bench_cw,
     figure4_tradeoff,
     figure5_evolution,
     model_sizes,
     pink_noise,
     suite,
     table1_brax,
+    table2_continual_world,
     table3_ablation,
 )
 from experiments.figure4_tradeoff import Figure4
 from experiments.first_task import FirstTask
 from experiments.table1_brax import Table1
+from experiments.table2_continual_world import Table2
 from experiments.table3_ablation import Table3
-from rewire_jax import config
+from rewire_jax import config, published
 from rewire_jax.errors import UserError
+from rewire_jax.methods import METHODS
 from rewire_jax.scenarios import SCENARIOS
-from tests.fake_run import GAP, SCORES, write_run
+from tests.fake_run import EDGE, GAP, SCORES, write_cw, write_run
 
 NAMES = ("halfcheetah/forgetting", "halfcheetah/transfer")
 
@@ -49,12 +53,27 @@ def trained(monkeypatch):
             folder.rename(folder.with_suffix(".before"))
         options = settings.options.checked()
         facts = config.to_json(dataclasses.replace(settings, options=options))
-        write_run(
-            folder,
-            stages=2 if stop and not resume else 3,
-            scores=SCORES * FACTORS.get((settings.method, settings.scenario), 1.0),
-            **{name: facts[name] for name in ("method", "seeds", "seed", "profile")},
-        )
+        known = {name: facts[name] for name in ("method", "seeds", "seed", "profile")}
+        if settings.scenario.startswith("continual_world/"):
+            names = tuple(task.name for task in scenario.tasks[: settings.tasks])
+            rate = RATE[settings.method, settings.scenario]
+            shape = len(names) + 1, len(names)
+            write_cw(
+                folder,
+                tasks=names,
+                stages=len(names),
+                scores=np.zeros(shape),
+                rates=np.full(shape, rate),
+                learning=np.full((len(names), 3), rate),
+                **known,
+            )
+        else:
+            write_run(
+                folder,
+                stages=2 if stop and not resume else 3,
+                scores=SCORES * FACTORS.get((settings.method, settings.scenario), 1.0),
+                **known,
+            )
         head = json.loads((folder / "settings.json").read_text())
         head["settings"] |= facts
         (folder / "settings.json").write_text(json.dumps(head))
@@ -63,6 +82,17 @@ def trained(monkeypatch):
     return calls
 
 
+RATE = {
+    ("rewire", "continual_world/t1"): 0.4,
+    ("rewire", "continual_world/t3"): 0.8,
+    ("rewire", "continual_world/cw10"): 0.5,
+    ("ft1", "continual_world/t1"): 0.1,
+    ("ft1", "continual_world/t3"): 0.3,
+    ("ft1", "continual_world/cw10"): 0.0,
+    ("ft1", "continual_world/window-close"): 0.5,
+    ("ft1", "continual_world/handle-press-side"): 0.6,
+    ("ft1", "continual_world/peg-unplug-side"): 0.7,
+}
 FACTORS = {("ft1", NAMES[0]): 0.5, ("ft1", NAMES[1]): 1.5}
 
 
@@ -107,6 +137,85 @@ def test_table1_averages_over_finished_runs(trained, tmp_path, capsys):
     assert resume
     assert "finished before" in capsys.readouterr().err
     assert "of 2 scenarios" not in (out / "table1.md").read_text()
+
+
+def test_table2_averages_success_rates_over_triplets(trained, tmp_path, capsys):
+    sequences = [f"continual_world/{name}" for name in ("t1", "t3", "cw10")]
+    job = Table2(scenarios=sequences, methods=("rewire", "ft1"), seeds=2, out=tmp_path)
+    table2_continual_world.run(job)
+    assert {s.scenario for _, s, _ in trained} == set(sequences)
+    out = tmp_path / "table2-quick"
+    found = {(r["sequences"], r["method"]): r for r in rows(out / "table2.csv")}
+    # Seed 1 solves EDGE more, and nothing is divided by SAC-N's.
+    for key, rate in {
+        ("CW3", "rewire"): (0.4 + 0.8) / 2,
+        ("CW3", "ft1"): (0.1 + 0.3) / 2,
+        ("CW10", "rewire"): 0.5,
+        ("CW10", "ft1"): 0.0,
+    }.items():
+        row = found[key]
+        assert float(row["performance"]) == pytest.approx(rate + EDGE / 2)
+        assert float(row["performance_std"]) == pytest.approx(EDGE / 2**0.5)
+    assert float(found["CW3", "ft1"]["paper_performance"]) == 0.29
+    assert float(found["CW10", "rewire"]["paper_performance"]) == 0.84
+    shown = (out / "table2.md").read_text()
+    assert shown.startswith(
+        "# Table 2 on Meta-World v3, quick profile, 30,000 interactions a task, "
+        "reward v2, mujoco backend, reduced budget (paper: 1,000,000)\n"
+    )
+    head = "| method | CW3 | model size | paper | CW10 | model size | paper |"
+    assert head in shown
+    assert "| Ours (rewire) | 0.65 ± 0.07 | 2.25 | 0.67 ± 0.09 | 0.55 ± 0.07 |" in shown
+    assert "Success rates are shares of episodes solved at any" in shown
+    # The other rule, from what there is; half is solved at the last step.
+    last = dataclasses.replace(job, success="last", train=False)
+    table2_continual_world.run(last)
+    assert len(trained) == 6
+    path = tmp_path / "table2-last-quick" / "table2.csv"
+    assert float(rows(path)[0]["performance"]) == pytest.approx((0.6 + EDGE / 2) / 2)
+    assert "solved at their last step" in path.with_suffix(".md").read_text()
+    assert (tmp_path / "table2-last-quick" / "continual_world-t1").is_dir()
+    capsys.readouterr()
+    with pytest.raises(UserError, match="not of probe/reach"):
+        table2_continual_world.run(Table2(scenarios=("probe/reach",), out=tmp_path))
+
+
+def test_table2_is_of_nine_sequences_and_all_methods():
+    sequences = Table2().scenarios
+    assert len(sequences) == len(set(sequences)) == 9
+    assert {published.sources(name)[0].table for name in sequences} == {"Table 2"}
+    runs = Table2().runs_of(dict.fromkeys(sequences[:1], "CW"))
+    assert [run.settings.method for run in runs["CW"]] == list(METHODS)
+
+
+def test_bench_on_continual_world_measures_transfer_if_asked(trained, tmp_path, capsys):
+    bench = bench_cw.Bench(seeds=2, out=tmp_path)
+    bench_cw.run(bench)
+    assert [(s.scenario, s.method) for _, s, _ in trained] == [
+        ("continual_world/t3", "rewire"),
+        ("continual_world/t3", "ft1"),
+    ]
+    assert "forward_transfer_mean" not in rows(tmp_path / "report.csv")[0]
+    # Without training, the runs of each task alone are missed, and said to be.
+    asked = dataclasses.replace(bench, transfer=True)
+    bench_cw.run(dataclasses.replace(asked, train=False))
+    assert "no forward transfer before" in capsys.readouterr().err
+    bench_cw.run(asked)
+    assert [(s.scenario, s.method, s.tasks) for _, s, _ in trained[2:]] == [
+        (f"continual_world/{name}", "ft1", 1)
+        for name in ("window-close", "handle-press-side", "peg-unplug-side")
+    ]
+    row = rows(tmp_path / "report.csv")[0]
+    # What is trained at 0.8 throughout, against 0.5, 0.6 and 0.7; one seed EDGE above.
+    alone = np.array([0.5, 0.6, 0.7]) + EDGE / 2
+    transfer = np.mean((0.8 + EDGE / 2 - alone) / (1 - alone))
+    assert float(row["forward_transfer_mean"]) == pytest.approx(transfer)
+    # Of a shortened sequence only what is trained is learned alone.
+    short = dataclasses.replace(asked, tasks=2, interactions=1_000)
+    assert [run.folder.parent.name for run in bench_cw.single(short)] == [
+        "continual_world-window-close-quick-1000",
+        "continual_world-handle-press-side-quick-1000",
+    ]
 
 
 def test_tables_of_what_there_is(trained, tmp_path):
@@ -214,6 +323,8 @@ def test_figure5_turns_modes_and_distillation_off(trained, tmp_path, monkeypatch
     [
         (bench_brax, bench_brax.Bench, "--methods ft1 magic"),
         (bench_brax, bench_brax.Bench, "--scenario probe/rech"),
+        (bench_cw, bench_cw.Bench, "--transfer --scenario probe/reach"),
+        (table2_continual_world, Table2, "--scenarios continual_world/t9"),
         (table1_brax, Table1, "--methods magic"),
         (table1_brax, Table1, "--scenarios probe/reach probe/rech"),
         (table3_ablation, Table3, "--scenario probe/reach --profile slow"),

@@ -1,0 +1,65 @@
+"""The paper's Table 2: success rates of all methods on Continual World.
+
+CW3 is the average over eight sequences of three tasks, CW10 is one of ten. Both are
+sequences on Meta-World v3, the paper's are on v1.
+"""
+
+from dataclasses import dataclass
+
+from experiments import paper_table, suite
+from rewire_jax import published
+from rewire_jax.config import require
+from rewire_jax.scores import SUCCESS, Success
+
+CW10 = "continual_world/cw10"
+SCENARIOS = (*(f"continual_world/t{number}" for number in range(1, 9)), CW10)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table2(paper_table.Table):
+    """What to run.
+
+    Attributes:
+      scenarios: names of the scenarios.
+      methods: names of the methods, or "all".
+      success: steps of an episode that count as solved, any or the last alone.
+    """
+
+    scenarios: tuple[str, ...] = SCENARIOS
+    success: Success = "any"
+
+
+def run(job: Table2) -> None:
+    """Trains what is not finished, and writes a report a scenario and the table.
+
+    Raises:
+      UserError: wrong arguments.
+      rewire_jax.Stopped: interrupted; the same command goes on.
+    """
+    for name in job.scenarios:
+        known = f"{SCENARIOS[0]} to {SCENARIOS[-2]} and {CW10}"
+        require(name in SCENARIOS, f"Table 2 is of {known}, not of {name}")
+    groups = {name: "CW10" if name == CW10 else "CW3" for name in job.scenarios}
+    runs = job.runs_of(groups)
+    settings = next(iter(runs.values()))[0].settings
+    title = (
+        f"Table 2 on Meta-World v3, {job.profile} profile, "
+        f"{settings.interactions:,} interactions a task, reward {settings.reward}, "
+        f"{settings.backend} backend"
+    )
+    if settings.interactions < (settings.paper_interactions or 0):
+        title += f", reduced budget (paper: {settings.paper_interactions:,})"
+    score = SUCCESS[job.success]
+    (paper,) = published.sources(CW10)
+    reading = (
+        f"Performance is the {score.noun}, averaged over tasks after the last of them; "
+        f"{suite.AVERAGED} {score.evaluated} The paper's results are {paper.made}."
+    )
+    out = job.folder("table2" if job.success == "any" else "table2-last")
+    paper_table.write(
+        job, runs, "sequences", title, reading, out / "table2", job.success
+    )
+
+
+if __name__ == "__main__":
+    suite.command(Table2, run, "table2_continual_world")
