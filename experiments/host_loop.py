@@ -1,0 +1,163 @@
+"""What the loop around Continual World's simulators costs beyond its parts.
+
+Simulators alone, updates alone, and the loop of both, without and with overlap, take
+turns; each is timed over the same number of steps. Ratios are of the least times.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import rewire_jax
+from experiments import suite
+from rewire_jax.config import require
+from rewire_jax.envs.base import HostEnvironment
+from rewire_jax.lanes import Lanes
+from rewire_jax.plan import Plan, prepare
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostLoop:
+    """What to measure.
+
+    Attributes:
+      scenario: of the domain "metaworld"; its first task is played.
+      methods: names of the methods.
+      seeds: members.
+      hidden: width of the layers; 0 for the paper's.
+      times: of 50 steps and 50 updates, in one measurement.
+      rounds: measurements of each kind.
+      out: result files, without a suffix.
+    """
+
+    scenario: str = "continual_world/t3"
+    methods: tuple[str, ...] = ("ft1", "rewire")
+    seeds: int = 1
+    hidden: int = 0
+    times: int = 20
+    rounds: int = 5
+    out: Path = suite.RESULTS / "host-loop"
+
+
+class Loop:
+    """One task's loop, somewhere in the middle of it."""
+
+    def __init__(self, plan: Plan):
+        """Begins the first task and makes its first updates."""
+        self.plan = plan
+        self.task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+        learner = plan.program.init(plan.members)
+        alive = np.ones(plan.places, bool)
+        self.state = plan.program.begin(plan.members, learner, alive, 0, self.task)
+        self.time = 0
+        settings = plan.settings
+        self.steps(-(-settings.warmup // settings.update_every) + 1)
+        self.updates(1)
+
+    def steps(self, times: int) -> None:
+        """Steps and updates."""
+        steps = times * self.plan.settings.update_every
+        self.state, _ = self.plan.program.chunk(
+            self.plan.members, self.state, 0, self.task, self.time, steps
+        )
+        jax.block_until_ready(self.state)
+        self.time += steps
+
+    def updates(self, times: int) -> None:
+        """Updates alone."""
+        self.state = self.plan.program.polish(
+            self.plan.members, self.state, 0, self.time, 0, times
+        )
+        jax.block_until_ready(self.state)
+
+
+def simulate(lanes: Lanes, environment: HostEnvironment, steps: int) -> None:
+    """Steps simulators with random actions, and resets them at their episodes' end."""
+    draw = np.random.default_rng(0)
+    count = len(lanes.seeds)
+    for _ in range(steps):
+        if lanes.task < 0 or lanes.steps[0] == environment.episode_length:
+            lanes.reset(0, draw.integers(2**31, size=count))
+        size = (count, environment.action_size)
+        lanes.step(draw.uniform(-1, 1, size).astype(np.float32))
+
+
+def timed(function: Callable[..., Any], *arguments: Any) -> float:
+    """Seconds."""
+    began = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - began
+
+
+def measure(job: HostLoop, method: str) -> dict[str, Any]:
+    """Milliseconds for 50 steps and 50 updates of all members, each kind's least."""
+    scenario = rewire_jax.make_scenario(job.scenario)
+    environment = scenario.environment
+    if not isinstance(environment, HostEnvironment):
+        raise rewire_jax.UserError(f"{job.scenario} is not stepped on the host")
+    paper = rewire_jax.preset(scenario, method, "paper")
+    sac = dataclasses.replace(paper.sac, hidden=job.hidden or paper.sac.hidden)
+    settings = dataclasses.replace(paper, tasks=1, seeds=job.seeds, sac=sac)
+    loops = [
+        Loop(prepare(dataclasses.replace(settings, overlap=overlap), scenario))
+        for overlap in (False, True)
+    ]
+    lanes = Lanes(environment, job.seeds * settings.envs)
+    least = dict.fromkeys(("simulators", "updates", "loop", "overlapped"), np.inf)
+    for _ in range(job.rounds):
+        steps = job.times * settings.update_every
+        taken = {
+            "simulators": timed(simulate, lanes, environment, steps),
+            "updates": timed(loops[0].updates, job.times),
+        }
+        for name, loop in zip(("loop", "overlapped"), loops, strict=True):
+            loop.steps(1)  # the simulators come to where this one is
+            taken[name] = timed(loop.steps, job.times)
+        least = {name: min(least[name], value) for name, value in taken.items()}
+    each = {name: 1e3 * value / job.times for name, value in least.items()}
+    parts = each["simulators"], each["updates"]
+    return {
+        "method": method,
+        "members": job.seeds,
+        "hidden": sac.hidden,
+        **{f"{name}_ms": value for name, value in each.items()},
+        "loop_over_sum": each["loop"] / sum(parts),
+        "overlapped_over_larger": each["overlapped"] / max(parts),
+    }
+
+
+def run(job: HostLoop) -> None:
+    """Measures all methods and writes the result.
+
+    Raises:
+      UserError: wrong arguments.
+    """
+    require(job.rounds > 0, f"--rounds must be at least 1, not {job.rounds}")
+    require(job.times > 0, f"--times must be at least 1, not {job.times}")
+    rows = [measure(job, method) for method in job.methods]
+    head = ["method", "members", "width", "simulators", "updates", "loop"]
+    head += ["÷ sum", "with overlap", "÷ larger"]
+    table = [head]
+    for row in rows:
+        cells = [f"{row[f'{name}_ms']:.0f} ms" for name in ("simulators", "updates")]
+        cells += [f"{row['loop_ms']:.0f} ms", f"{row['loop_over_sum']:.2f}"]
+        cells += [f"{row['overlapped_ms']:.0f} ms"]
+        cells += [f"{row['overlapped_over_larger']:.2f}"]
+        names = [row["method"], str(row["members"]), str(row["hidden"])]
+        table.append(names + cells)
+    title = f"{job.scenario}, paper profile: milliseconds for 50 steps and 50 updates"
+    notes = [
+        "Simulators and updates were timed alone. With overlap, the next steps are "
+        "made while updates go on, by the policy before these."
+    ]
+    suite.write(job.out, title, table, notes, rows)
+
+
+if __name__ == "__main__":
+    suite.command(HostLoop, run, "host_loop")
