@@ -1,7 +1,6 @@
 """Meta-World on the host: the package `metaworld`, on C MuJoCo."""
 
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,16 +12,14 @@ from rewire_jax.errors import UserError
 
 try:
     import gymnasium
-    import mujoco
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+    from metaworld.sawyer_xyz_env import SawyerXYZEnv
 except ImportError as error:
     raise UserError(
         "Meta-World on MuJoCo is not installed: pip install 'rewire_jax[cw]'."
     ) from error
 
 _VERSION = "-v3"
-# The arrays of a model that are its scene; shapes and textures are large, and fixed.
-_SCENE = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "site_", "tendon_")
 NAMES = tuple(name.removesuffix(_VERSION) for name in ALL_V3_ENVIRONMENTS)
 
 
@@ -52,7 +49,7 @@ def make_environment(reward: str, names: tuple[str, ...]) -> HostEnvironment:
 class Simulator(gymnasium.Env):
     """Episodes of several tasks, each determined by its seed and its actions.
 
-    Goal and start are drawn anew at every reset. Episodes have no end; the package
+    Goal and start are drawn anew at every reset. Episodes have no end, but the package
     takes at most 500 steps. A task's model is built at its first episode, and kept.
     """
 
@@ -62,7 +59,7 @@ class Simulator(gymnasium.Env):
     def __init__(self, names: tuple[str, ...], reward: str) -> None:
         self._names = names
         self._reward = reward
-        self._scenes: dict[int, _Scene] = {}
+        self._simulations: dict[int, SawyerXYZEnv] = {}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -79,11 +76,13 @@ class Simulator(gymnasium.Env):
         assert seed is not None
         assert options is not None
         task = int(options["task"])
-        if task not in self._scenes:
-            self._scenes[task] = _Scene(self._names[task], self._reward)
-        self._simulation = self._scenes[task].renewed()
-        self._simulation.seed(int(seed))
-        observation, _ = self._simulation.reset()
+        if task not in self._simulations:
+            self._simulations[task] = _simulation(self._names[task], self._reward)
+        self._current = self._simulations[task]
+        # The package's reset lays the task out twice, the second time from MuJoCo's
+        # own reset: once seeded, nothing that acts is left of what was played before.
+        self._current.seed(int(seed))
+        observation, _ = self._current.reset()
         return observation.astype(np.float32), {}
 
     def step(
@@ -99,51 +98,19 @@ class Simulator(gymnasium.Env):
           and whether time did, both never; whether the task is solved, as
           `{"success": bool}`.
         """
-        observation, reward, _, _, info = self._simulation.step(action)
+        observation, reward, _, _, info = self._current.step(action)
         success = {"success": bool(info["success"])}
         return observation.astype(np.float32), float(reward), False, False, success
 
 
-class _Scene:
-    """One of the package's environments that can be had as new, time and again.
-
-    Its `reset` leaves a lot of what was played before: positions in the model that it
-    overwrites, the data's solver state and derived positions, attributes. All of it is
-    put back, so that every reset is the first one after construction.
-    """
-
-    def __init__(self, name: str, reward: str) -> None:
-        env = ALL_V3_ENVIRONMENTS[name + _VERSION](reward_function_version=reward)
-        env._set_task_called = True  # it is the seed that sets the task
-        env._freeze_rand_vec = False
-        env.seeded_rand_vec = True
-        env._partially_observable = False
-        del env.sawyer_observation_space  # cached, with the goal bounded to zeros
-        self._env = env
-        self._attributes = _own(vars(env))
-        self._model = [
-            (array, array.copy())
-            for field in dir(env.model)
-            if field.startswith(_SCENE)
-            and isinstance(array := getattr(env.model, field), np.ndarray)
-        ]
-
-    def renewed(self) -> Any:
-        """The environment as it was made; it has still to be seeded and reset."""
-        env = self._env
-        for array, made in self._model:
-            array[...] = made
-        mujoco.mj_resetData(env.model, env.data)
-        mujoco.mj_forward(env.model, env.data)
-        env.__dict__ = _own(self._attributes)
-        return env
-
-
-def _own(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy whose arrays may be written to; views of the simulation stay views."""
-    return {
-        name: value.copy()
-        if isinstance(value, np.ndarray) and value.flags.owndata
-        else value
-        for name, value in attributes.items()
-    }
+def _simulation(name: str, reward: str) -> SawyerXYZEnv:
+    """One of the package's environments, which draws start and goal from its seed."""
+    env = ALL_V3_ENVIRONMENTS[name + _VERSION](reward_function_version=reward)
+    env._set_task_called = True
+    env._freeze_rand_vec = False
+    env.seeded_rand_vec = True
+    # The goal is seen. Observations are clipped to a space that bounds a hidden goal
+    # to zeros, and is cached.
+    env._partially_observable = False
+    del env.sawyer_observation_space
+    return env
