@@ -130,7 +130,7 @@ def _make_environment(env: PipelineEnv) -> Environment:
 
 def _normalize(system: System, backend: str) -> System:
     """Makes every leaf an array and the masses those that act."""
-    changed: dict[str, Any] = {"tex_data": jnp.zeros(0, jnp.uint8)}  # half a megabyte
+    changed: dict[str, Any] = {"tex_data": np.zeros(0, np.uint8)}  # half a megabyte
     if backend in ("positional", "spring"):
         # These two raise each mass to 1 - spring_mass_scale (Ant: to 0) before
         # they use it, which would shrink a body factor or undo it.
