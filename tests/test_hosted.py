@@ -1,6 +1,10 @@
 import dataclasses
 import itertools
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -274,6 +278,33 @@ def test_a_run_tells_of_success(tmp_path):
     reports = [json.loads(line) for line in table]
     assert [row["interactions"] for row in reports] == [40, 80, 120, 160] * 2
     assert all("success" in row and "success_last" in row for row in reports)
+
+
+def test_a_killed_run_resumes_in_the_middle_of_an_episode(tmp_path):
+    # Real simulators; the checkpoint lies within an episode of 200 steps.
+    words = "continual_world/t3 --method ft1 --profile quick --tasks 2"
+    words += " --interactions 2160 --warmup 200 --updates 2 --update-every 40"
+    words += " --hidden 8 --batch-size 8 --report-every 120 --checkpoint-every 1240"
+    words += " --eval-episodes 1"
+    command = [sys.executable, "-m", "rewire_jax.cli", "train", *words.split()]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    one = subprocess.Popen([*command, "--out", str(whole)], stderr=subprocess.PIPE)
+    process = subprocess.Popen([*command, "--out", str(killed)], stderr=subprocess.PIPE)
+    table = killed / "training.jsonl"
+    while process.poll() is None:
+        # In the second task, past its checkpoint.
+        if table.exists() and len(table.read_text().splitlines()) >= 18 + 12:
+            process.send_signal(signal.SIGKILL)
+            break
+        time.sleep(0.002)
+    assert process.wait() == -signal.SIGKILL
+    (kept,) = (killed / "checkpoints").glob("task-001-step-*")
+    assert int(kept.name.rpartition("-")[2]) % 200 != 0
+    resumed = [*command, "--out", str(killed), "--resume"]
+    subprocess.run(resumed, check=True, capture_output=True)
+    assert one.wait() == 0
+    for name in ("results.jsonl", "training.jsonl"):
+        assert (killed / name).read_bytes() == (whole / name).read_bytes()
 
 
 def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():

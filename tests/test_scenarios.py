@@ -100,6 +100,46 @@ def test_there_are_nine_and_the_probe():
     assert list(list_scenarios()) == sorted(list_scenarios())
 
 
+CONTINUAL_WORLD = {
+    "t1": "push window-close hammer",
+    "t2": "hammer window-close faucet-close",
+    "t3": "window-close handle-press-side peg-unplug-side",
+    "t4": "faucet-close shelf-place peg-unplug-side",
+    "t5": "faucet-close shelf-place push-back",
+    "t6": "stick-pull peg-unplug-side stick-pull",
+    "t7": "stick-pull push-back push-wall",
+    "t8": "push-wall shelf-place push-back",
+    "cw10": "hammer push-wall faucet-close push-back stick-pull handle-press-side push"
+    " shelf-place window-close peg-unplug-side",
+}
+
+
+@pytest.mark.parametrize("name", CONTINUAL_WORLD)
+def test_continual_worlds_sequences(name):
+    scenario = make_scenario(f"continual_world/{name}")
+    names = CONTINUAL_WORLD[name].split()
+    assert [task.name for task in scenario.tasks] == names
+    assert (scenario.domain, scenario.backend) == ("metaworld", "mujoco")
+    assert (scenario.reward, scenario.interactions) == ("v2", 1_000_000)
+    distinct = list(dict.fromkeys(names))
+    places = [int(task.data.physics) for task in scenario.tasks]
+    assert places == [distinct.index(n) for n in names]
+    assert scenario.environment.episode_length == 200
+    for task in names:
+        alone = make_scenario(f"continual_world/{task}")
+        assert [task.name for task in alone.tasks] == [task]
+
+
+def test_there_are_two_versions_of_rewards():
+    scenario = make_scenario("continual_world/t6", reward="v1")
+    assert scenario.reward == "v1"
+    assert scenario.environment is not make_scenario("continual_world/t6").environment
+    with pytest.raises(UserError, match="v3"):
+        make_scenario("continual_world/t6", reward="v3")
+    with pytest.raises(UserError, match="positional"):
+        make_scenario("continual_world/t6", "positional")
+
+
 def test_the_papers_changes():
     met = {domain: set() for domain in CHANGES}
     for name in PAPER:

@@ -371,3 +371,28 @@ def test_one_trace_for_all_tasks_of_rewire():
     assert all(function._cache_size() in (1, 2) for function in functions.values())
     again = {name: f._cache_size() for name, f in functions.items()}
     assert {n: f._cache_size() for n, f in sequence("rewire", 2).items()} == again
+
+
+def test_varied_environments_start_each_episode_from_a_reset_of_its_own():
+    varied = SCENARIO.environment._replace(varied=True)
+    make = find_method("ft1").make
+    shape = SHAPE._replace(transitions=70)
+    programs = [
+        compiled.build(e, make, SPEC, shape, options("ft1", 0), MESH)
+        for e in (varied, SCENARIO.environment)
+    ]
+    length, members = varied.episode_length, crowd()
+    states = [go(p, members, begin(p, members), [3 * length])[0] for p in programs]
+    fresh, stored = (np.asarray(s.collection.buffer.observation) for s in states)
+    # Up to the first end nothing is different.
+    np.testing.assert_array_equal(fresh[:, :length], stored[:, :length])
+    # One of each seed: two configurations share these.
+    starts = fresh[:2, : 3 * length : length].reshape(-1, 2)
+    assert len(np.unique(starts, axis=0)) == len(starts)
+    same = stored[:, : 3 * length : length]
+    np.testing.assert_array_equal(same[:, 0], same[:, 1])
+    # What an episode led to is still known.
+    finals = [np.asarray(s.collection.buffer.final) for s in states]
+    np.testing.assert_array_equal(finals[0][:, 0], finals[1][:, 0])
+    parts = go(programs[0], members, begin(programs[0], members), [length - 1, 1, 40])
+    equal(parts[0], states[0])

@@ -1,0 +1,34 @@
+from rewire_jax.methods import METHODS
+from rewire_jax.presets import preset
+from rewire_jax.scenarios import make_scenario
+
+
+def test_continual_worlds_loop_is_the_published_one():
+    scenario = make_scenario("continual_world/t3")
+    for method in METHODS:
+        paper = preset(scenario, method)
+        sac = paper.sac
+        assert (paper.envs, paper.updates, paper.update_every) == (1, 50, 50)
+        assert (paper.warmup, paper.random_interactions) == (1_000, 1_000)
+        assert (paper.interactions, paper.buffer) == (1_000_000, 1_000_000)
+        assert (sac.batch_size, sac.hidden, sac.depth) == (128, 256, 3)
+        assert sac.lr_policy == sac.lr_critic == sac.lr_temperature == 1e-3
+        assert (sac.policy_delay, sac.target_delay, sac.reward_scale) == (1, 1, 1)
+        assert (sac.initial_temperature, sac.target_multiplier) == (2.7, 2)
+        assert (paper.reward, paper.backend, paper.overlap) == ("v2", "mujoco", False)
+    assert preset(scenario, "ft_l2").options.coefficient == 1e5
+    assert preset(scenario, "ewc").options.coefficient == 1e4
+    # As many interactions of choosing as with 8 episodes of 1,000 steps, about.
+    csp = preset(scenario, "csp")
+    assert csp.options.rollouts * csp.selection_episodes * 200 == 6_400
+
+
+def test_quick_is_the_paper_profile_with_less_of_it():
+    scenario = make_scenario("continual_world/t6", reward="v1")
+    quick, paper = (preset(scenario, "rewire", p) for p in ("quick", "paper"))
+    assert quick.interactions < paper.interactions == quick.paper_interactions
+    assert quick.sac.hidden < paper.sac.hidden
+    assert (quick.updates, quick.update_every) == (50, 50)
+    assert quick.tasks == paper.tasks == 3  # though stick-pull comes twice
+    assert quick.options.head_slots == 2
+    assert quick.reward == "v1"
