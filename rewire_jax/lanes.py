@@ -1,7 +1,9 @@
 """Simulators side by side on the host, in processes where there are cores for them."""
 
 import functools
+import multiprocessing
 import os
+import signal
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -47,7 +49,7 @@ class Lanes:
         # Only those who have such an environment have gymnasium.
         from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-        makers = [environment.make] * count
+        makers = [functools.partial(_make, environment)] * count
         mode, cores = AutoresetMode.DISABLED, _cores()
         self._vector = (
             SyncVectorEnv(makers, autoreset_mode=mode)
@@ -93,6 +95,13 @@ class Lanes:
         return Moment(
             observation, reward.astype(np.float32), terminal, success.astype(bool)
         )
+
+
+def _make(environment: HostEnvironment) -> Any:
+    if multiprocessing.parent_process():
+        # Ctrl-C reaches all processes of a terminal; the first one says when to stop.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return environment.make()
 
 
 def _cores() -> int:

@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -305,6 +306,28 @@ def test_a_killed_run_resumes_in_the_middle_of_an_episode(tmp_path):
     assert one.wait() == 0
     for name in ("results.jsonl", "training.jsonl"):
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_ctrl_c_leaves_the_simulators_until_all_is_saved(tmp_path):
+    words = "continual_world/t3 --method ft1 --profile quick --tasks 1 --seeds 2"
+    words += " --interactions 20000 --warmup 200 --updates 1 --update-every 40"
+    words += " --hidden 8 --batch-size 8 --report-every 80 --checkpoint-every 0"
+    words += f" --eval-episodes 1 --out {tmp_path / 'run'}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "rewire_jax.cli", "train", *words.split()],
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        text=True,
+    )
+    table = tmp_path / "run" / "training.jsonl"
+    while process.poll() is None and not table.exists():
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate()
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert "--resume" in said
+    assert list((tmp_path / "run" / "checkpoints").glob("task-000-step-*"))
 
 
 def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():
