@@ -1,11 +1,13 @@
 """Meta-World on MJX-Warp against C MuJoCo, along recorded episodes of experts.
 
 Needs MTCWorldMJX: `make test-mjx`. `python -m experiments.record_experts` made the
-recordings. Tolerances hold observations of the first 0.3 m or so and rewards from 0 to
-10; a hand moves up to a centimetre a step.
+recordings. To read the tolerances by: positions are in metres, of which a hand moves
+0.01 in a step, and rewards go from 0 to 10.
 """
 
+import dataclasses
 import importlib.util
+import json
 import sys
 from pathlib import Path
 
@@ -15,9 +17,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+import rewire_jax
 from rewire_jax.envs import metaworld
 from rewire_jax.envs.base import TaskChange
 from rewire_jax.errors import UserError
+from rewire_jax.scenarios import make_scenario
 
 installed = pytest.mark.skipif(
     importlib.util.find_spec("MTCWorldMJX") is None, reason="make test-mjx runs it"
@@ -48,7 +52,8 @@ def replayed():
 
     For each task `first`, the observation after a reset to the recorded start;
     `chosen`, indices of states, with the steps predicted from these; `free`, the
-    recorded actions played without a look at the recording.
+    recorded actions played without a look at the recording, and `last`, the scene
+    some steps after these.
     """
     import MTCWorldMJX
 
@@ -76,7 +81,7 @@ def replayed():
             state = environment.step(task, state, action)
             return state, state._replace(inner=())
 
-        return jax.lax.scan(step, state, actions)[1]
+        return jax.lax.scan(step, state, actions)
 
     def replay(name, recording):
         task = domain.make_task(TaskChange(name, extra={"task": name}))
@@ -106,12 +111,13 @@ def replayed():
         states = states._replace(inner=jnp.stack([at(index) for index in chosen]))
         longest = max(len(other["actions"]) for other in recordings.values())
         actions = np.pad(recording["actions"], ((0, longest - length), (0, 0)))
-        played = free(task, state._replace(inner=packed(scene)), actions)
+        last, played = free(task, state._replace(inner=packed(scene)), actions)
         return {
             "first": np.asarray(state.observation),
             "chosen": chosen,
             "forced": forced(task, states, recording["actions"][chosen]),
             "free": jax.tree.map(lambda leaf: np.asarray(leaf[:length]), played),
+            "last": unravel(last.inner[: len(zeros)]),
         }
 
     with pytest.MonkeyPatch.context() as patch:
@@ -178,6 +184,26 @@ def test_an_episode_takes_its_course_and_succeeds_in_time(replayed, name):
 
 
 @installed
+@pytest.mark.parametrize("name", NAMES)
+def test_what_can_be_hit_is_where_the_scene_has_it(replayed, name):
+    import MTCWorldMJX
+    import mujoco
+
+    scene = replayed[name]["last"]
+    path = MTCWorldMJX.ENV_CLS_MAP[f"{name}-v3"].xml_path.fget(None)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    asmade = model.body_pos.copy()
+    model.body_pos[:] = scene.model["body_pos"]
+    data = mujoco.MjData(model)
+    for field in ("qpos", "mocap_pos", "mocap_quat"):
+        getattr(data, field)[:] = scene.data[field]
+    mujoco.mj_kinematics(model, data)
+    np.testing.assert_allclose(scene.data["geom_xpos"], data.geom_xpos, atol=1e-4)
+    if name != "push":  # which places no body that is fixed to the world
+        assert np.abs(model.body_pos - asmade).max() > 1e-2
+
+
+@installed
 def test_starts_are_drawn_anew_and_by_the_key():
     domain = metaworld.make_domain("mjx", "v2", ("faucet-close",))
     task = domain.make_task(TaskChange("it", extra={"task": "faucet-close"}))
@@ -187,6 +213,34 @@ def test_starts_are_drawn_anew_and_by_the_key():
     np.testing.assert_array_equal(seen[0], seen[2])
     for one, other in ((0, 1), (0, 3), (1, 3)):
         assert np.abs(seen[one, GOAL] - seen[other, GOAL]).max() > 1e-3
+
+
+@installed
+@pytest.mark.slow
+def test_a_run_learns_over_the_end_of_an_episode(tmp_path):
+    scenario = make_scenario("continual_world/t3", "mjx", "v2")
+    quick = rewire_jax.preset(scenario, "ft1", "quick")
+    settings = dataclasses.replace(
+        quick,
+        tasks=1,
+        interactions=300,
+        warmup=100,
+        random_interactions=100,
+        eval_episodes=1,
+        report_every=300,
+        checkpoint_every=0,
+        sac=dataclasses.replace(quick.sac, hidden=16, depth=1, batch_size=8),
+    )
+    rewire_jax.train(settings, tmp_path / "run", scenario=scenario)
+    lines = (tmp_path / "run" / "results.jsonl").read_text().splitlines()
+    before, after = (json.loads(line) for line in lines)
+    assert before["interactions"]["training"] == 0
+    assert after["interactions"]["training"] == 300
+    for row in before, after:
+        assert 0 < row["return"] < 2000
+        assert row["success_last"] <= row["success"] <= 1
+    (line,) = (tmp_path / "run" / "training.jsonl").read_text().splitlines()
+    assert 0 < json.loads(line)["return"] < 2000
 
 
 @installed
