@@ -12,6 +12,7 @@ simulators are not where a state says, they are brought there by playing these a
 import functools
 import itertools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -48,9 +49,9 @@ class _Functions(NamedTuple):
     Attributes:
       roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
       begin: `(members, learner, alive, index, episodes) -> State`.
-      sequence: `(members, index, time) -> ` coloured noise.
+      sequence: `(members, index, time) -> ` coloured noise, on the CPU.
       act: `(members, acting, label, observation, steps, index, time, sequence) ->
-        actions, label`.
+        actions, label`, on the CPU: it then waits for no other device's updates.
       absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
         buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
         are due after them; the given buffer is used up.
@@ -171,14 +172,15 @@ def _compile(
         key, method = task_keys(member, index)[1], make(member)
         return training.inspect(key, state, time, length, method, member.sac)
 
-    def over(function, *axes, donate=()):
+    def over(function, *axes, donate=(), mesh=mesh):
         return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
 
+    host = population.host()
     return _Functions(
         roots=over(roots, 0, None),
         begin=over(begin, 0, 0, 0, None, 0),
-        sequence=over(sequence, 0, None, None),
-        act=over(act, 0, 0, 0, 0, 0, None, None, 0),
+        sequence=over(sequence, 0, None, None, mesh=host),
+        act=over(act, 0, 0, 0, 0, 0, None, None, 0, mesh=host),
         absorb=over(absorb, 0, 0, 0, 0, None, None, 0, donate=(2,)),
         inspect=over(inspect, 0, 0, 0, None, None),
     )
@@ -203,48 +205,58 @@ def _chunk(
     lanes = open_lanes(environment, episodes.steps.size)
     roots = np.asarray(functions.roots(members, index))
     _recall(lanes, task, roots, episodes, buffer, time)
-    acting = acting or (learner.params, learner.memory)
+    here = functools.partial(population.place, mesh=population.host())
+    actors, label = here(members), here(label)
+    acting = here(acting or (learner.params, learner.memory))
     colored = bool(members.sac.noise_color)
     sequence: Any = None
-    updates = 0
-    reports = []
-    for start in range(time, time + steps, shape.every):
-        played = []
-        for now in range(start, start + shape.every):
-            if colored and (sequence is None or now % environment.episode_length == 0):
-                sequence = functions.sequence(members, index, now)
-            seen = episodes.state.observation
-            drawn, label = functions.act(
-                members, acting, label, seen, episodes.steps, index, now, sequence
+    learning: Any = None
+    made, metrics, updates = [], [], 0
+    # JAX begins what one thread asks for in turn: actions would wait for updates.
+    with ThreadPoolExecutor(1) as other:
+        for start in range(time, time + steps, shape.every):
+            played = []
+            for now in range(start, start + shape.every):
+                if colored and (sequence is None or now % len(sequence[0]) == 0):
+                    sequence = functions.sequence(actors, index, now)
+                seen = episodes.state.observation
+                drawn, label = functions.act(
+                    actors, acting, label, seen, episodes.steps, index, now, sequence
+                )
+                action = np.asarray(drawn)
+                episodes, step = _advance(
+                    environment, lanes, task, roots, episodes, action
+                )
+                played.append((action, jax.tree.map(np.asarray, label), step))
+            along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
+            made.append(along[2])
+            updates += int(shape.due(start + shape.every))
+            if learning:
+                learner, buffer, alive, values = learning.result()
+                metrics.append(values)
+            before = learner
+            learning = other.submit(
+                functions.absorb, members, learner, buffer, alive, index, start, along
             )
-            action = np.asarray(drawn)
-            episodes, step = _advance(environment, lanes, task, roots, episodes, action)
-            played.append((action, jax.tree.map(np.asarray, label), step))
-        along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
-        before = learner.params, learner.memory
-        # It is only begun here: with overlap, the next steps are made meanwhile.
-        learner, buffer, alive, metrics = functions.absorb(
-            members, learner, buffer, alive, index, start, along
-        )
-        acting = before if shape.overlap else (learner.params, learner.memory)
-        reports.append((along[2], metrics))
-        updates += int(shape.due(start + shape.every))
-    made, metrics = zip(*reports, strict=True)
+            newest = before if shape.overlap else learning.result()[0]
+            acting = here((newest.params, newest.memory))
+        learner, buffer, alive, values = learning.result()
+        metrics.append(values)
     totals = jax.tree.map(lambda *values: sum(map(np.asarray, values)), *metrics)
     end = time + steps
     report = _report(made, totals, updates)._replace(
         inspected=functions.inspect(members, learner, buffer, index, end)
     )
-    episodes = population.place(episodes, mesh)
+    episodes, label = population.place((episodes, label), mesh)
     return training.State(
         learner,
         Collection(buffer, episodes, label),
         alive,
-        acting if shape.overlap else (),
+        population.place(acting, mesh) if shape.overlap else (),
     ), report
 
 
-def _report(made: tuple[Step, ...], metrics: Any, updates: int) -> Report:
+def _report(made: list[Step], metrics: Any, updates: int) -> Report:
     """What a chunk's steps `[members, every, envs]` each sum up to."""
     step = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *made)
     ended = step.terminal | step.truncated
@@ -359,7 +371,9 @@ def _recall(
             lanes.reset(lanes.task, seeds, joins)
         action = np.asarray(buffer.action[:, (time - longest + number) % rows])
         action = action * np.asarray(task.action_scale)
-        lanes.step(action.reshape(len(seeds), -1))
+        moment = lanes.step(action.reshape(len(seeds), -1))
+        if moment.terminal.any():  # in those that join later
+            lanes.reset(lanes.task, seeds, moment.terminal)
     if longest and (joins := steps == 0).any():
         lanes.reset(lanes.task, seeds, joins)
     if not there():

@@ -1,16 +1,18 @@
 """Simulators side by side on the host, in processes where there are cores for them."""
 
 import functools
-import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.envs.base import HostEnvironment
+from rewire_jax.errors import UserError
 
 Array = NDArray[Any]
 
@@ -49,16 +51,16 @@ class Lanes:
         # Only those who have such an environment have gymnasium.
         from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-        makers = [functools.partial(_make, environment)] * count
+        makers = [environment.make] * count
         mode, cores = AutoresetMode.DISABLED, _cores()
-        self._vector = (
-            SyncVectorEnv(makers, autoreset_mode=mode)
-            if min(count, cores) == 1
-            # JAX has threads, which a forked process would lack.
-            else AsyncVectorEnv(
-                makers, context="spawn", autoreset_mode=mode, max_concurrency=cores
-            )
-        )
+        if min(count, cores) == 1:
+            self._vector: Any = SyncVectorEnv(makers, autoreset_mode=mode)
+        else:
+            with _deaf_to_interrupts():
+                # JAX has threads, which a forked process would lack.
+                self._vector = AsyncVectorEnv(
+                    makers, context="spawn", autoreset_mode=mode, max_concurrency=cores
+                )
         self.task = -1
         self.seeds = np.zeros(count, np.int64)
         self.steps = np.zeros(count, np.int64)
@@ -79,8 +81,9 @@ class Lanes:
         """
         where = np.ones(len(self.seeds), bool) if where is None else where
         options = {"task": task, "reset_mask": where}
-        given: list[int | None] = [int(seed) for seed in seeds]
-        self.observation, _ = self._vector.reset(seed=given, options=options)
+        given = [int(seed) for seed in seeds]
+        with _whole():
+            self.observation, _ = self._vector.reset(seed=given, options=options)
         self.task = task
         self.seeds = np.where(where, np.asarray(seeds), self.seeds)
         self.steps = np.where(where, 0, self.steps)
@@ -88,7 +91,8 @@ class Lanes:
 
     def step(self, actions: Array) -> Moment:
         """Steps all lanes; `actions` is `[lanes, actions]` float32 in [-1, 1]."""
-        observation, reward, terminal, _, info = self._vector.step(actions)
+        with _whole():
+            observation, reward, terminal, _, info = self._vector.step(actions)
         self.observation = observation
         self.steps = self.steps + 1
         success = info.get("success", np.zeros(len(self.seeds), bool))
@@ -97,11 +101,35 @@ class Lanes:
         )
 
 
-def _make(environment: HostEnvironment) -> Any:
-    if multiprocessing.parent_process():
-        # Ctrl-C reaches all processes of a terminal; the first one says when to stop.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return environment.make()
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Processes that are started here go on at Ctrl-C, until the first one ends them.
+
+    Raises:
+      UserError: they end while they start.
+    """
+    # Started later, it would let interrupts through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    except (EOFError, ConnectionError) as error:
+        raise UserError(
+            "the simulators' processes end while they start: a script must train under "
+            "`if __name__ == '__main__':`, since they import it"
+        ) from error
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _whole() -> Iterator[None]:
+    """What is left in its middle serves nobody any more."""
+    try:
+        yield
+    except BaseException:
+        open_lanes.cache_clear()
+        raise
 
 
 def _cores() -> int:

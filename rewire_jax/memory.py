@@ -110,6 +110,7 @@ def need(plan: Plan) -> Need:
         share = size(chosen.policies) // chosen.valid.size
         work.append(plan.rows * (share + episode * settings.selection_episodes))
     environments = size(mine.collection) - size(mine.collection.buffer)
+    environments += size(mine.acting)
     if settings.sac.noise_color:
         draw = functools.partial(
             noise.colored,

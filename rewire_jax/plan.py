@@ -118,10 +118,17 @@ def prepare(
         every=settings.update_every,
         overlap=settings.overlap,
     )
+    hosted = isinstance(environment, HostEnvironment)
     require(
-        not settings.overlap or isinstance(environment, HostEnvironment),
+        hosted or not settings.overlap,
         f"--overlap: {scenario.name} on {scenario.backend} steps on the device, where "
         "nothing is left to overlap",
+    )
+    least = min(settings.interactions // settings.envs, environment.episode_length)
+    require(
+        shape.transitions >= least or not hosted,
+        f"--buffer {settings.buffer} is too short for an episode, which is taken up "
+        f"again from it: give at least {least * settings.envs}",
     )
     sequence = scenario.tasks[: settings.tasks]
     seeds = range(settings.seed, settings.seed + settings.seeds)
@@ -133,7 +140,7 @@ def prepare(
     example = jax.tree.map(lambda _: 0.0, settings.options)
     built = program.build(environment, entry.make, spec, shape, example, mesh)
     method = entry.make(spec, settings.options)
-    number, rows = _selection(settings, built, members)
+    number, rows = _selection(settings, built, members, hosted)
     budget, round_ = settings.interactions, settings.update_every * settings.envs
     if method.in_budget:
         played = number * settings.selection_episodes
@@ -160,7 +167,9 @@ def prepare(
     )
 
 
-def _selection(settings: Settings, built: Program, members: Members) -> tuple[int, int]:
+def _selection(
+    settings: Settings, built: Program, members: Members, hosted: bool
+) -> tuple[int, int]:
     """How many candidates there are, and the rows to play them in."""
     if built.candidates is None or not settings.selection_episodes:
         return 0, 0
@@ -168,4 +177,4 @@ def _selection(settings: Settings, built: Program, members: Members) -> tuple[in
     number = jax.eval_shape(built.candidates, members, learner, 0).valid.shape[1]
     # Some rows for nothing, where that lets an evaluation's compiled function serve.
     same = settings.selection_episodes == settings.eval_episodes
-    return number, max(number, settings.tasks) if same else number
+    return number, max(number, settings.tasks) if same and not hosted else number

@@ -133,6 +133,8 @@ def _continual_world(paper: Settings) -> Settings:
         random_interactions=start,
         buffer=1_000_000,
         eval_episodes=50,
+        report_every=5_000,
+        checkpoint_every=50_000,
     )
     if paper.profile == "paper":
         return paper

@@ -5,7 +5,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -164,13 +167,15 @@ def test_chunks_do_not_matter_nor_what_was_played_between(overlap):
 
 
 def test_environments_that_end_apart_are_recalled():
-    plan = planned(walk.walker(0.9), envs=3, warmup=12)
+    # Many, so that some end while they play on for those that are recalled later.
+    plan = planned(walk.walker(0.9), envs=9, warmup=36)
     start = begin(plan)
-    whole, _ = go(plan, start, [8, 8, 8])
+    whole, _ = go(plan, start, [8, 8, 8, 8])
     state, _ = go(plan, start, [8, 8])
-    assert len(set(state.collection.episodes.steps.ravel().tolist())) > 1
-    open_lanes.cache_clear()
-    state, _ = go(plan, state, [8], time=16)
+    for done in (16, 24):
+        assert len(set(state.collection.episodes.steps.ravel().tolist())) > 2
+        open_lanes.cache_clear()
+        state, _ = go(plan, state, [8], time=done)
     equal(whole, state)
 
 
@@ -180,6 +185,36 @@ def test_a_simulator_that_does_not_repeat_itself_is_told():
     open_lanes.cache_clear()
     with pytest.raises(UserError, match="does not repeat the episode"):
         go(plan, state, [4], time=8)
+
+
+def test_a_buffer_must_hold_the_episode_that_is_played():
+    with pytest.raises(UserError, match=f"--buffer 5 is too short.*{walk.LENGTH}"):
+        planned(buffer=5)
+    assert prepare(settings(buffer=5), walk.scenario(walk.COMPILED))
+
+
+def test_lanes_that_failed_are_not_used_again():
+    environment = walk.walker(0.5)
+    lanes = open_lanes(environment, 1)
+    lanes.reset(0, [1])
+    assert open_lanes(environment, 1) is lanes
+    with pytest.raises(AssertionError):
+        lanes.step(np.zeros((1, 2)))  # not float32
+    assert open_lanes(environment, 1) is not lanes
+
+
+def test_a_script_without_a_main_guard_is_told(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"import sys; sys.path.insert(0, {str(Path.cwd())!r})\n"
+        "from tests import walk\n"
+        "import rewire_jax.lanes as lanes\n"
+        "lanes._cores = lambda: 2\n"
+        "lanes.open_lanes(walk.walker(), 2)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.returncode
+    assert "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
 
 
 def test_every_episode_has_a_start_of_its_own():
@@ -231,6 +266,46 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
     plain = planned(walk.walker(0.5), random_interactions=0)
     state, _ = go(plain, begin(plain), [5 * EVERY])
     assert (state.collection.buffer.action[0, 16:20] != final.action[0, 16:20]).any()
+
+
+def test_with_overlap_steps_and_updates_are_made_at_the_same_time(monkeypatch):
+    """A simulator that waits for an update to be begun, and an update for its steps."""
+    plan = planned(walk.walker(), overlap=True, interactions=80)
+    state = begin(plan)
+    state, _ = go(plan, state, [8])  # all is compiled
+    submitted, stepped = [], []
+    submit, step = ThreadPoolExecutor.submit, Lanes.step
+    held = threading.Event()
+
+    def slow_submit(self, function, *arguments):
+        def held_back():
+            # The updates are not begun before steps that need not wait for them.
+            assert held.wait(60)
+            return function(*arguments)
+
+        submitted.append(len(stepped))
+        held.clear()
+        return submit(self, held_back)
+
+    def counted(self, actions):
+        stepped.append(len(submitted))
+        if len(stepped) % EVERY == 0:
+            held.set()
+        return step(self, actions)
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", slow_submit)
+    monkeypatch.setattr(Lanes, "step", counted)
+    threading.Timer(30, held.set).start()
+    began = time.monotonic()
+    done = threading.Thread(target=go, args=(plan, state, [12]), kwargs={"time": 8})
+    done.start()
+    while len(stepped) < 3 * EVERY and time.monotonic() - began < 25:
+        time.sleep(0.01)
+    # All steps were made, though no update had been let through before its next ones.
+    assert len(stepped) == 3 * EVERY
+    held.set()
+    done.join()
+    assert submitted == [EVERY, 2 * EVERY, 3 * EVERY]
 
 
 def test_rollouts_are_those_of_a_loop():
