@@ -16,6 +16,8 @@ def test_continual_worlds_loop_is_the_published_one():
         assert (sac.policy_delay, sac.target_delay, sac.reward_scale) == (1, 1, 1)
         assert (sac.initial_temperature, sac.target_multiplier) == (2.7, 2)
         assert (paper.reward, paper.backend, paper.overlap) == ("v2", "mujoco", False)
+    # A hundredth of FT-L2's, as on halfcheetah/forgetting.
+    assert preset(scenario, "rewire").options.beta == 1e3
     assert preset(scenario, "ft_l2").options.coefficient == 1e5
     assert preset(scenario, "ewc").options.coefficient == 1e4
     # As many interactions of choosing as with 8 episodes of 1,000 steps, about.
