@@ -111,7 +111,7 @@ _PUBLISHED = {
 # Ours, since none were published. Of tau and noise those that a small sweep on
 # window-close ranked first, alpha as elsewhere. The weights are held firmly there in
 # FT-L2: beta is as far below that one's coefficient as on halfcheetah/forgetting.
-_CONTINUAL_WORLD = {"tau": 1.0, "noise": 0.1, "alpha": 1e-5, "beta": 1e3}
+_CONTINUAL_WORLD = RewireSettings(tau=1.0, noise=0.1, alpha=1e-5, beta=1e3)
 
 
 def preset(scenario: str, period: int, profile: str) -> RewireSettings:
@@ -133,7 +133,7 @@ def preset(scenario: str, period: int, profile: str) -> RewireSettings:
 
 def _published(scenario: str, period: int) -> RewireSettings:
     if scenario.startswith("continual_world/"):
-        return RewireSettings(head_slots=period, **_CONTINUAL_WORLD)
+        return dataclasses.replace(_CONTINUAL_WORLD, head_slots=period)
     if scenario not in _PUBLISHED:
         return RewireSettings(head_slots=period)
     tau, noise, alpha, beta, slots = _PUBLISHED[scenario]
