@@ -1,16 +1,13 @@
 """The loop of a task whose environments are stepped on the host.
 
 It makes the same steps, updates and random draws as `training.train`; only where
-environments are stepped differs. What is in the middle of an episode is known by the
-episode's seed and the actions since, which lie in the replay buffer: where the
-simulators are not where a state says, they are brought there by playing these again.
+environments are stepped differs.
 """
 
 # NumPy's arrays stand where the records below have JAX's.
 # mypy: disable-error-code="arg-type"
 
 import functools
-import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -21,13 +18,13 @@ import numpy as np
 from jax.sharding import Mesh
 from numpy.typing import NDArray
 
-from rewire_jax import population, rollout, training
-from rewire_jax.envs.base import HostEnvironment, State, Task
-from rewire_jax.errors import UserError
-from rewire_jax.lanes import Lanes, open_lanes
+from rewire_jax import exploring, population, simulated, training
+from rewire_jax.envs.base import HostEnvironment, Task
+from rewire_jax.lanes import open_lanes, shown
 from rewire_jax.methods.base import Method
+from rewire_jax.playing import play
 from rewire_jax.population import Members
-from rewire_jax.rollout import Episode, Rollout, Step, Success
+from rewire_jax.rollout import Rollout, Step
 from rewire_jax.training import Collection, Report, Shape
 
 Array = NDArray[Any]
@@ -90,12 +87,12 @@ def loop(
     counted: list[Any] = [functions.act, functions.absorb]
 
     def first(members, index, task):
-        count = len(members.keys) * shape.envs
-        lanes = open_lanes(environment, count)
-        roots = np.asarray(functions.roots(members, index))
-        number = np.zeros((len(members.keys), shape.envs), np.int32)
-        observation = lanes.reset(int(task.physics), _seeds(roots, number).ravel())
-        return _episodes(environment, number, _seen(observation, task, number.shape))
+        shaped = len(members.keys), shape.envs
+        lanes = open_lanes(environment, shaped[0] * shaped[1])
+        number = np.zeros(shaped, np.int32)
+        seeds = simulated.seeds(np.asarray(functions.roots(members, index)), number)
+        observation = lanes.reset(int(task.physics), seeds.ravel())
+        return simulated.begin(environment, number, shown(observation, task, shaped))
 
     def start(members, learner, alive, index, task):
         episodes = population.place(first(members, index, task), mesh)
@@ -104,13 +101,13 @@ def loop(
     def expect(members, learner, alive, index, task):
         number = np.zeros((len(members.keys), shape.envs), np.int32)
         observation = np.zeros((*number.shape, environment.observation_size))
-        episodes = _episodes(environment, number, observation.astype(np.float32))
+        episodes = simulated.begin(environment, number, observation.astype(np.float32))
         return jax.eval_shape(functions.begin, members, learner, alive, index, episodes)
 
     return Loop(
         begin=start,
         chunk=functools.partial(_chunk, environment, functions, shape, mesh),
-        rollout=functools.partial(_rollout, environment, shape, act),
+        rollout=functools.partial(play, environment, shape.envs, act),
         expect=expect,
         traces=lambda: sum(function._cache_size() for function in counted),
     )
@@ -131,11 +128,11 @@ def _compile(
 
     def sequence(member, index, time):
         key = task_keys(member, index)[1]
-        return training.draw_sequence(key, time, size, length, member.sac)
+        return exploring.draw_sequence(key, time, size, length, member.sac)
 
     def act(member, acting, label, observation, steps, index, time, sequence):
         key = jax.random.fold_in(task_keys(member, index)[1], time)
-        return training.explore(
+        return exploring.explore(
             jax.random.split(key)[0],
             acting,
             label,
@@ -143,7 +140,7 @@ def _compile(
             steps,
             time,
             make(member),
-            shape,
+            shape.random,
             sequence,
         )
 
@@ -204,7 +201,7 @@ def _chunk(
     episodes = jax.tree.map(np.asarray, episodes)
     lanes = open_lanes(environment, episodes.steps.size)
     roots = np.asarray(functions.roots(members, index))
-    _recall(lanes, task, roots, episodes, buffer, time)
+    simulated.recall(lanes, task, roots, episodes, buffer, time)
     here = functools.partial(population.place, mesh=population.host())
     actors, label = here(members), here(label)
     acting = here(acting or (learner.params, learner.memory))
@@ -224,7 +221,7 @@ def _chunk(
                     actors, acting, label, seen, episodes.steps, index, now, sequence
                 )
                 action = np.asarray(drawn)
-                episodes, step = _advance(
+                episodes, step = simulated.advance(
                     environment, lanes, task, roots, episodes, action
                 )
                 played.append((action, jax.tree.map(np.asarray, label), step))
@@ -273,186 +270,3 @@ def _report(made: list[Step], metrics: Any, updates: int) -> Report:
         inspected={},
         successes=jax.tree.map(total, step.success),
     )
-
-
-def _seeds(roots: Array, number: Array) -> Array:
-    """Seeds `[members, envs]` of each environment's so many-th episode."""
-    return np.array(
-        [
-            [
-                np.random.SeedSequence([*root, env, of]).generate_state(1)[0]
-                for env, of in enumerate(row)
-            ]
-            for root, row in zip(roots, number, strict=True)
-        ],
-        np.int64,
-    )
-
-
-def _seen(observation: Array, task: Task, shape: tuple[int, ...]) -> Array:
-    """What a policy is shown, `[*shape, observations]`."""
-    return observation.reshape(*shape, -1) * np.asarray(task.observation_mask)
-
-
-def _episodes(environment: HostEnvironment, number: Array, observation: Array) -> Any:
-    """Environments `[members, envs]` at the start of an episode.
-
-    An environment's inner state is the number of its episode. Unlike compiled ones it
-    keeps no start: the next episode has one of its own.
-    """
-    shape = number.shape
-    false, zero = np.zeros(shape, bool), np.zeros(shape, np.float32)
-    known = environment.success
-    state = State(number, observation, zero, false, false if known else ())
-    success = Success(false, false) if known else ()
-    return Episode(state, (), np.zeros(shape, np.int32), zero, success)
-
-
-def _advance(
-    environment: HostEnvironment,
-    lanes: Lanes,
-    task: Task,
-    roots: Array,
-    episodes: Any,
-    action: Array,
-) -> tuple[Any, Step]:
-    """Steps all environments; ended episodes are followed by new ones."""
-    shape = episodes.steps.shape
-    scaled = action * np.asarray(task.action_scale)
-    moment = lanes.step(scaled.reshape(-1, action.shape[-1]))
-    last = following = _seen(moment.observation, task, shape)
-    reward, terminal = moment.reward.reshape(shape), moment.terminal.reshape(shape)
-    known = environment.success
-    solved = moment.success.reshape(shape) if known else ()
-    steps, score = episodes.steps + np.int32(1), episodes.score + reward
-    truncated = (steps >= environment.episode_length) & ~terminal
-    success = rollout.succeed(episodes.success, solved)
-    ended, number = terminal | truncated, episodes.state.inner
-    if ended.any():
-        number = number + ended.astype(np.int32)
-        seeds = _seeds(roots, number).ravel()
-        following = _seen(lanes.reset(lanes.task, seeds, ended.ravel()), task, shape)
-    return Episode(
-        State(number, following, reward, terminal, solved),
-        (),
-        np.where(ended, np.int32(0), steps),
-        np.where(ended, np.float32(0), score),
-        jax.tree.map(lambda x: x & ~ended, success),
-    ), Step(reward, terminal, truncated, last, following, score, success)
-
-
-def _recall(
-    lanes: Lanes, task: Task, roots: Array, episodes: Any, buffer: Any, time: int
-) -> None:
-    """Brings the simulators where the episodes are, by playing them again.
-
-    Raises:
-      UserError: they come out elsewhere.
-    """
-    seeds, steps = _seeds(roots, episodes.state.inner).ravel(), episodes.steps.ravel()
-
-    def there() -> bool:
-        seen = _seen(lanes.observation, task, episodes.steps.shape)
-        return (
-            lanes.task == int(task.physics)
-            and np.array_equal(lanes.seeds, seeds)
-            and np.array_equal(lanes.steps, steps)
-            and np.array_equal(seen, episodes.state.observation, equal_nan=True)
-        )
-
-    if there():
-        return
-    longest = int(steps.max())
-    lanes.reset(int(task.physics), seeds)
-    rows = buffer.action.shape[1]
-    # The shorter ones join later, so that all are there at the same time.
-    for number in range(longest):
-        if number and (joins := steps == longest - number).any():
-            lanes.reset(lanes.task, seeds, joins)
-        action = np.asarray(buffer.action[:, (time - longest + number) % rows])
-        action = action * np.asarray(task.action_scale)
-        moment = lanes.step(action.reshape(len(seeds), -1))
-        if moment.terminal.any():  # in those that join later
-            lanes.reset(lanes.task, seeds, moment.terminal)
-    if longest and (joins := steps == 0).any():
-        lanes.reset(lanes.task, seeds, joins)
-    if not there():
-        raise UserError(
-            "the simulator does not repeat the episode that the checkpoint lies in: go "
-            "on where it was written, with the same versions, or delete the checkpoint "
-            "with -step- in its name, to repeat the task"
-        )
-
-
-@functools.lru_cache
-def _greedy(act: Callable[..., Any]) -> Callable[..., jax.Array]:
-    """`(policies [lanes], observations [lanes]) -> actions`, without exploration."""
-    return jax.jit(lambda policy, seen: jnp.tanh(jax.vmap(act)(policy, seen)[0]))
-
-
-def _rollout(
-    environment: HostEnvironment,
-    shape: Shape,
-    act: Callable[..., Any],
-    tasks: Task,
-    policies: Any,
-    keys: jax.Array,
-    count: int,
-) -> Rollout:
-    """Plays whole episodes, see `rollout.episodes`."""
-    members, rows = keys.shape
-    lanes = open_lanes(environment, members * shape.envs)
-    roots = np.asarray(jax.random.key_data(keys))
-    played = (members, rows, count)
-    returns, lengths = np.zeros(played, np.float32), np.zeros(played, np.int32)
-    solved = [np.zeros(played, bool) for _ in range(2)]
-    for row in range(rows):
-        task = jax.tree.map(lambda leaf, row=row: leaf[row], tasks)
-        places = list(itertools.product(range(members), range(count)))
-        while places:
-            # The last lanes may play what others play, too.
-            turn = list(itertools.islice(itertools.cycle(places), len(lanes.seeds)))
-            places = places[len(turn) :]
-            who, which = np.array(turn).T
-            at = who, np.full(len(turn), row), which
-            seeds = [
-                np.random.SeedSequence([*roots[m, row], e]).generate_state(1)[0]
-                for m, e in turn
-            ]
-            policy = jax.tree.map(lambda leaf, w=who, r=row: leaf[w, r], policies)
-            result = _play(environment, lanes, act, task, policy, seeds)
-            for kept, values in zip((returns, lengths, *solved), result, strict=True):
-                kept[at] = values
-    success = Success(*solved) if environment.success else ()
-    return Rollout(returns, lengths, success)
-
-
-def _play(
-    environment: HostEnvironment,
-    lanes: Lanes,
-    act: Callable[..., Any],
-    task: Task,
-    policy: Any,
-    seeds: list[Any],
-) -> tuple[Array, Array, Array, Array]:
-    """An episode in each lane: return, length, success at any and at the last step."""
-    size = len(seeds)
-    observation = lanes.reset(int(task.physics), seeds)
-    alive, any_, last = np.ones(size, bool), np.zeros(size, bool), np.zeros(size, bool)
-    returns, lengths = np.zeros(size, np.float32), np.zeros(size, np.int32)
-    for _ in range(environment.episode_length):
-        action = np.asarray(_greedy(act)(policy, _seen(observation, task, (size,))))
-        moment = lanes.step(action * np.asarray(task.action_scale))
-        returns, lengths = returns + np.where(alive, moment.reward, 0), lengths + alive
-        any_, last = (
-            any_ | (alive & moment.success),
-            np.where(alive, moment.success, last),
-        )
-        alive = alive & ~moment.terminal
-        if not alive.any():
-            break
-        observation = moment.observation
-        if moment.terminal.any():
-            # What ended must be begun anew; nothing there counts any more.
-            observation = lanes.reset(lanes.task, seeds, moment.terminal)
-    return returns, lengths, any_, last

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rewire_jax.envs.base import HostEnvironment
+from rewire_jax.envs.base import HostEnvironment, Task
 from rewire_jax.errors import UserError
 
 Array = NDArray[Any]
@@ -138,6 +138,16 @@ def _cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not Linux
         return os.cpu_count() or 1
+
+
+def draw_seed(*words: int) -> int:
+    """A seed that follows from some numbers."""
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+
+def shown(observation: Array, task: Task, shape: tuple[int, ...]) -> Array:
+    """What a policy is shown, `[*shape, observations]`."""
+    return observation.reshape(*shape, -1) * np.asarray(task.observation_mask)
 
 
 @functools.lru_cache(maxsize=1)

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax import networks, noise, replay, rollout, sac
+from rewire_jax import exploring, replay, rollout, sac
 from rewire_jax.config import SacSettings
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Memory, Method, Params
+from rewire_jax.methods.base import Method
 
 
 class Shape(NamedTuple):
@@ -108,70 +108,6 @@ def all_finite(tree: Any) -> jax.Array:
     return jnp.isfinite(total)
 
 
-def explore(
-    key: jax.Array,
-    acting: tuple[Params, Memory],
-    label: Any,
-    observation: jax.Array,
-    steps: jax.Array,
-    time: jax.Array,
-    method: Method,
-    shape: Shape,
-    sequence: jax.Array | None,
-) -> tuple[jax.Array, Any]:
-    """Exploring actions of all environments of a member.
-
-    Args:
-      key: a random key.
-      acting: the method's parameters and memory.
-      label: the method's, of the step before.
-      observation: `[envs, observations]`.
-      steps: `[envs]` int, of the running episodes.
-      time: `[]` int, steps of all environments made before in the task.
-      method: the method.
-      shape: static sizes.
-      sequence: the coloured noise that `time` lies in, None where noise is white.
-
-    Returns:
-      Actions `[envs, actions]`, and the label that belongs to the step.
-    """
-    params, memory = acting
-    context_key, action_key, random_key, label_key = jax.random.split(key, 4)
-    label = method.label(label_key, memory, label, steps)
-    context = method.context(context_key, memory, "act", label)
-    mean, log_std = method.distribution(params, memory, context, observation)
-    if sequence is None:
-        action, _ = networks.sample_action(action_key, mean, log_std)
-    else:
-        action = jnp.tanh(mean + jnp.exp(log_std) * sequence[time % len(sequence)])
-    if shape.random:
-        uniform = jax.random.uniform(random_key, action.shape, minval=-1.0)
-        action = jnp.where(time < shape.random, uniform, action)
-    return action, label
-
-
-def draw_sequence(
-    key: jax.Array,
-    time: jax.Array,
-    size: tuple[int, ...],
-    length: int,
-    settings: SacSettings,
-) -> jax.Array:
-    """Coloured noise `[length, *size]`, as long as an episode, that a step lies in.
-
-    Args:
-      key: the task's, as in `train`.
-      time: `[]` int, of the step.
-      size: of the noise in a step.
-      length: of an episode.
-      settings: SAC's.
-    """
-    # A key that the steps do not use.
-    start_key = jax.random.fold_in(key, time - time % length)
-    sequence_key = jax.random.split(start_key, 4)[3]
-    return noise.colored(sequence_key, settings.noise_color, length, size)
-
-
 def collect(
     key: jax.Array,
     state: State,
@@ -184,7 +120,7 @@ def collect(
 ) -> tuple[Collection, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
     learner, (buffer, episodes, label), *_ = state
-    action, label = explore(
+    action, label = exploring.explore(
         key,
         (learner.params, learner.memory),
         label,
@@ -192,7 +128,7 @@ def collect(
         episodes.steps,
         time,
         method,
-        shape,
+        shape.random,
         sequence,
     )
     length = environment.episode_length
@@ -366,7 +302,7 @@ def train(
             # It is not part of the state: a chunk draws it anew.
             sequence = jax.lax.cond(
                 (index % length == 0) | (index == time),
-                lambda: draw_sequence(key, index, size, length, settings),
+                lambda: exploring.draw_sequence(key, index, size, length, settings),
                 lambda: sequence,
             )
         collect_key, update_key = jax.random.split(jax.random.fold_in(key, index))

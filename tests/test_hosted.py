@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewire_jax import continual, hosted, training
+from rewire_jax import continual, exploring, simulated, training
 from rewire_jax.config import Settings
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.errors import UserError
@@ -243,7 +243,7 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
     method = find_method("ft1").make(plan.spec, plan.settings.options)
 
     def acted(learner, time):
-        action, _ = training.explore(
+        action, _ = exploring.explore(
             jax.random.split(jax.random.fold_in(key[1], time))[0],
             jax.tree.map(lambda x: x[0], (learner.params, learner.memory)),
             (),
@@ -251,7 +251,7 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
             jnp.zeros(1, jnp.int32),
             jnp.asarray(time),
             method,
-            training.Shape(1, 1, 0, 0, 1),
+            0,
             None,
         )
         return action
@@ -434,11 +434,11 @@ def test_overlap_needs_something_to_overlap():
 
 def test_seeds_are_told_apart():
     roots = np.array([[0, 1], [0, 2]], np.uint32)
-    drawn = hosted._seeds(roots, np.array([[0, 0, 1], [0, 5, 1]]))
+    drawn = simulated.seeds(roots, np.array([[0, 0, 1], [0, 5, 1]]))
     assert drawn.shape == (2, 3)
     assert len(np.unique(drawn)) == 6
     np.testing.assert_array_equal(
-        drawn, hosted._seeds(roots, np.array([[0, 0, 1], [0, 5, 1]]))
+        drawn, simulated.seeds(roots, np.array([[0, 0, 1], [0, 5, 1]]))
     )
 
 
