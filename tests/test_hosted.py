@@ -383,6 +383,31 @@ def test_a_killed_run_resumes_in_the_middle_of_an_episode(tmp_path):
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.mark.parametrize(("method", "overlap"), [("rewire", True), ("csp", False)])
+def test_what_is_needed_within_a_task_is_saved(method, overlap, tmp_path, monkeypatch):
+    made = settings(method, overlap=overlap, interactions=240, checkpoint_every=100)
+    scenario = walk.scenario(walk.walker(0.5))
+    whole = continual.train(made, tmp_path / "whole", scenario=scenario)
+    called = continual.Run.chunk
+
+    def stopping(self, now, task):
+        if now.stage == 1 and now.steps == 120:
+            raise KeyboardInterrupt
+        return called(self, now, task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(continual.Run, "chunk", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            continual.train(made, tmp_path / "stopped", scenario=scenario)
+    assert list((tmp_path / "stopped" / "checkpoints").glob("task-001-step-*"))
+    open_lanes.cache_clear()
+    resumed = continual.train(
+        made, tmp_path / "stopped", scenario=scenario, resume=True
+    )
+    for name in ("results.jsonl", "training.jsonl"):
+        assert (resumed / name).read_bytes() == (whole / name).read_bytes()
+
+
 def test_ctrl_c_leaves_the_simulators_until_all_is_saved(tmp_path):
     words = "continual_world/t3 --method ft1 --profile quick --tasks 1 --seeds 2"
     words += " --interactions 20000 --warmup 200 --updates 1 --update-every 40"
