@@ -47,7 +47,9 @@ class _Functions(NamedTuple):
       roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
       begin: `(members, learner, alive, index, episodes) -> State`.
       sequence: `(members, index, time) -> ` coloured noise, on the CPU.
-      act: `(members, acting, label, observation, steps, index, time, sequence) ->
+      keys: `(members, index, time) -> [members, every, 2]` uint32, those of the next
+        steps' actions.
+      act: `(members, key, acting, label, observation, steps, time, sequence) ->
         actions, label`, on the CPU: it then waits for no other device's updates.
       absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
         buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
@@ -58,6 +60,7 @@ class _Functions(NamedTuple):
     roots: Callable[..., jax.Array]
     begin: Callable[..., training.State]
     sequence: Callable[..., jax.Array]
+    keys: Callable[..., jax.Array]
     act: Callable[..., tuple[jax.Array, Any]]
     absorb: Callable[..., tuple[Any, Any, Any, Any]]
     inspect: Callable[..., dict[str, jax.Array]]
@@ -130,10 +133,16 @@ def _compile(
         key = task_keys(member, index)[1]
         return exploring.draw_sequence(key, time, size, length, member.sac)
 
-    def act(member, acting, label, observation, steps, index, time, sequence):
-        key = jax.random.fold_in(task_keys(member, index)[1], time)
+    def keys(member, index, time):
+        def of(now):
+            key = jax.random.fold_in(task_keys(member, index)[1], now)
+            return jax.random.key_data(jax.random.split(key)[0])
+
+        return jax.vmap(of)(time + jnp.arange(shape.every))
+
+    def act(member, key, acting, label, observation, steps, time, sequence):
         return exploring.explore(
-            jax.random.split(key)[0],
+            jax.random.wrap_key_data(key),
             acting,
             label,
             observation,
@@ -169,15 +178,16 @@ def _compile(
         key, method = task_keys(member, index)[1], make(member)
         return training.inspect(key, state, time, length, method, member.sac)
 
-    def over(function, *axes, donate=(), mesh=mesh):
+    def over(function, *axes, donate=()):
         return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
 
-    host = population.host()
     return _Functions(
         roots=over(roots, 0, None),
         begin=over(begin, 0, 0, 0, None, 0),
-        sequence=over(sequence, 0, None, None, mesh=host),
-        act=over(act, 0, 0, 0, 0, 0, None, None, 0, mesh=host),
+        sequence=jax.jit(jax.vmap(sequence, (0, None, None))),
+        keys=over(keys, 0, None, None),
+        # Called at each step, and so not through `shard_map`, which takes its time.
+        act=jax.jit(jax.vmap(act, (0, 0, 0, 0, 0, 0, None, 0))),
         absorb=over(absorb, 0, 0, 0, 0, None, None, 0, donate=(2,)),
         inspect=over(inspect, 0, 0, 0, None, None),
     )
@@ -202,7 +212,10 @@ def _chunk(
     lanes = open_lanes(environment, episodes.steps.size)
     roots = np.asarray(functions.roots(members, index))
     simulated.recall(lanes, task, roots, episodes, buffer, time)
-    here = functools.partial(population.place, mesh=population.host())
+    # What is asked for at each step must lie ready.
+    task = jax.tree.map(np.asarray, task)
+    cpu = jax.local_devices(backend="cpu")[0]
+    here = functools.partial(jax.device_put, device=cpu)
     actors, label = here(members), here(label)
     acting = here(acting or (learner.params, learner.memory))
     colored = bool(members.sac.noise_color)
@@ -213,12 +226,20 @@ def _chunk(
     with ThreadPoolExecutor(1) as other:
         for start in range(time, time + steps, shape.every):
             played = []
+            keys = np.asarray(functions.keys(members, index, start))
             for now in range(start, start + shape.every):
                 if colored and (sequence is None or now % len(sequence[0]) == 0):
                     sequence = functions.sequence(actors, index, now)
                 seen = episodes.state.observation
                 drawn, label = functions.act(
-                    actors, acting, label, seen, episodes.steps, index, now, sequence
+                    actors,
+                    keys[:, now - start],
+                    acting,
+                    label,
+                    seen,
+                    episodes.steps,
+                    now,
+                    sequence,
                 )
                 action = np.asarray(drawn)
                 episodes, step = simulated.advance(

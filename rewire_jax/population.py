@@ -102,11 +102,6 @@ def mesh(members: int) -> Mesh:
     return Mesh(devices[:number], (_AXIS,))
 
 
-def host() -> Mesh:
-    """The CPU, where environments that are not compiled are stepped."""
-    return Mesh(jax.local_devices(backend="cpu")[:1], (_AXIS,))
-
-
 def place(tree: Any, mesh: Mesh) -> Any:
     """Spreads a pytree with a leading axis `[members]` over the devices."""
     return jax.device_put(tree, NamedSharding(mesh, P(_AXIS)))
