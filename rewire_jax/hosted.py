@@ -53,7 +53,7 @@ class _Functions(NamedTuple):
         actions, label`, on the CPU: it then waits for no other device's updates.
       absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
         buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
-        are due after them; the given buffer is used up.
+        are due after them; what is given is used up, but for the learner with overlap.
       inspect: `(members, learner, buffer, index, time) -> metrics`.
     """
 
@@ -188,7 +188,10 @@ def _compile(
         keys=over(keys, 0, None, None),
         # Called at each step, and so not through `shard_map`, which takes its time.
         act=jax.jit(jax.vmap(act, (0, 0, 0, 0, 0, 0, None, 0))),
-        absorb=over(absorb, 0, 0, 0, 0, None, None, 0, donate=(2,)),
+        # With overlap the former learner acts meanwhile, and must be left.
+        absorb=over(
+            absorb, 0, 0, 0, 0, None, None, 0, donate=(2,) if shape.overlap else (1, 2)
+        ),
         inspect=over(inspect, 0, 0, 0, None, None),
     )
 
