@@ -33,7 +33,8 @@ class HostLoop:
       seeds: members.
       widths: of the layers; 0 for the paper's. With narrow ones simulators and
         updates take times more alike, and overlap has more to gain.
-      times: of 50 steps and 50 updates, in one measurement.
+      times: of 50 steps and 50 updates, in one measurement; 40 are those between two
+        progress reports of the quick profile.
       rounds: measurements of each kind.
       out: result files, without a suffix.
     """
@@ -42,8 +43,8 @@ class HostLoop:
     methods: tuple[str, ...] = ("ft1", "rewire")
     seeds: int = 1
     widths: tuple[int, ...] = (0, 32)
-    times: int = 20
-    rounds: int = 5
+    times: int = 40
+    rounds: int = 3
     out: Path = suite.RESULTS / "host-loop"
 
 
