@@ -166,8 +166,8 @@ def test_inverted_actions_mirror_the_normal_task(domain):
 
 def test_masked_actions_cost_nothing_and_hidden_entries_are_zero():
     off = make_task("halfcheetah", actions={"*": 0.0}, hidden=0.5)
-    _, observed, reward, terminal = roll("halfcheetah", off, 1)
-    _, full, free, _ = roll("halfcheetah", make_task("halfcheetah"), 0)
+    _, observed, reward, terminal, *_ = roll("halfcheetah", off, 1)
+    _, full, free, *_ = roll("halfcheetah", make_task("halfcheetah"), 0)
     np.testing.assert_allclose(reward, free, rtol=1e-5)
     np.testing.assert_allclose(observed, full * off.observation_mask, rtol=1e-5)
     assert np.any(full != observed)

@@ -198,7 +198,7 @@ def test_the_delays_run_on_from_step_to_step(program, whole):
 def test_a_member_that_is_not_finite_is_frozen(program, started, whole, place):
     members = crowd()
     halfway, _ = go(program, members, started, [10])
-    learner, collection, _ = halfway
+    learner, collection, *_ = halfway
 
     def poison(leaf, value=jnp.nan):
         return leaf.at[1].set(value)
