@@ -46,7 +46,8 @@ def play(
     returns, lengths = np.zeros(played, np.float32), np.zeros(played, np.int32)
     solved = [np.zeros(played, bool) for _ in range(2)]
     for row in range(rows):
-        task = jax.tree.map(lambda leaf, row=row: leaf[row], tasks)
+        # What is asked for at each step must lie ready.
+        task = jax.tree.map(lambda leaf, row=row: np.asarray(leaf[row]), tasks)
         places = list(itertools.product(range(members), range(count)))
         while places:
             # The last lanes may play what others play, too.
