@@ -178,8 +178,7 @@ def _compile(
         key, method = task_keys(member, index)[1], make(member)
         return training.inspect(key, state, time, length, method, member.sac)
 
-    def over(function, *axes, donate=()):
-        return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
+    over = functools.partial(population.over, mesh)
 
     return _Functions(
         roots=over(roots, 0, None),

@@ -132,3 +132,13 @@ def compiled(
     # arguments, for which a function is traced twice.
     spread = NamedSharding(mesh, P(_AXIS))
     return jax.jit(local, donate_argnums=donate, out_shardings=spread)
+
+
+def over(
+    mesh: Mesh,
+    function: Callable[..., Any],
+    *axes: int | None,
+    donate: tuple[int, ...] = (),
+) -> Callable[..., Any]:
+    """A function of one member made one of whole populations, see `compiled`."""
+    return compiled(jax.vmap(function, axes), axes, mesh, donate)

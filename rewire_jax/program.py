@@ -181,8 +181,7 @@ def build(
     def size(member, learner):
         return make(spec, member.options).size(learner.params, learner.memory)
 
-    def over(function, *axes, donate=()):
-        return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
+    over = functools.partial(population.over, mesh)
 
     def method_of(member):
         return make(spec, member.options)
@@ -236,8 +235,7 @@ def _loop(
             shape=shape,
         )
 
-    def over(function, *axes, donate=()):
-        return population.compiled(jax.vmap(function, axes), axes, mesh, donate)
+    over = functools.partial(population.over, mesh)
 
     def episodes(tasks, policies, keys, count):
         rows = keys.shape[1]
@@ -251,5 +249,5 @@ def _loop(
         chunk=trains,
         rollout=episodes,
         expect=functools.partial(jax.eval_shape, begins),
-        traces=trains._cache_size,
+        traces=trains._cache_size,  # type: ignore[attr-defined]
     )
