@@ -49,8 +49,9 @@ class _Functions(NamedTuple):
       sequence: `(members, index, time) -> ` coloured noise, on the CPU.
       keys: `(members, index, time) -> [members, every, 2]` uint32, those of the next
         steps' actions.
-      act: `(members, key, acting, label, observation, steps, time, sequence) ->
-        actions, label`, on the CPU: it then waits for no other device's updates.
+      act: `(members, key, acting, label, observation, steps, time, sequence, random)
+        -> actions, label`, on the CPU: it then waits for no other device's updates;
+        `random` is static, steps of the task that begin with uniform actions.
       absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
         buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
         are due after them; what is given is used up, but for the learner with overlap.
@@ -140,18 +141,21 @@ def _compile(
 
         return jax.vmap(of)(time + jnp.arange(shape.every))
 
-    def act(member, key, acting, label, observation, steps, time, sequence):
-        return exploring.explore(
-            jax.random.wrap_key_data(key),
-            acting,
-            label,
-            observation,
-            steps,
-            time,
-            make(member),
-            shape.random,
-            sequence,
-        )
+    def act(members, key, acting, label, observation, steps, time, sequence, random):
+        def one(member, key, acting, label, observation, steps, sequence):
+            return exploring.explore(
+                jax.random.wrap_key_data(key),
+                acting,
+                label,
+                observation,
+                steps,
+                time,
+                make(member),
+                random,
+                sequence,
+            )
+
+        return jax.vmap(one)(members, key, acting, label, observation, steps, sequence)
 
     def absorb(member, learner, buffer, alive, index, time, played):
         def store(number, buffer):
@@ -186,7 +190,7 @@ def _compile(
         sequence=jax.jit(jax.vmap(sequence, (0, None, None))),
         keys=over(keys, 0, None, None),
         # Called at each step, and so not through `shard_map`, which takes its time.
-        act=jax.jit(jax.vmap(act, (0, 0, 0, 0, 0, 0, None, 0))),
+        act=jax.jit(act, static_argnames="random"),
         # With overlap the former learner acts meanwhile, and must be left.
         absorb=over(
             absorb, 0, 0, 0, 0, None, None, 0, donate=(2,) if shape.overlap else (1, 2)
@@ -242,6 +246,8 @@ def _chunk(
                     episodes.steps,
                     now,
                     sequence,
+                    # Later none are drawn, which is a third of an action's time.
+                    random=shape.random if now < shape.random else 0,
                 )
                 action = np.asarray(drawn)
                 episodes, step = simulated.advance(

@@ -85,16 +85,14 @@ def advance(
     truncated = (steps >= environment.episode_length) & ~terminal
     success = rollout.succeed(episodes.success, solved)
     ended, number = terminal | truncated, episodes.state.inner
+    after = steps, score, success
     if ended.any():
         number = number + ended.astype(np.int32)
         begun = seeds(roots, number).ravel()
         following = shown(lanes.reset(lanes.task, begun, ended.ravel()), task, shape)
+        after = jax.tree.map(lambda x: np.where(ended, np.zeros_like(x), x), after)
     return Episode(
-        State(number, following, reward, terminal, solved),
-        (),
-        np.where(ended, np.int32(0), steps),
-        np.where(ended, np.float32(0), score),
-        jax.tree.map(lambda x: x & ~ended, success),
+        State(number, following, reward, terminal, solved), (), *after
     ), Step(reward, terminal, truncated, last, following, score, success)
 
 
