@@ -1,53 +1,81 @@
-import json
-from dataclasses import replace
-
 import jax
+import pytest
 
 from experiments import bench_speed
+from experiments.speed.part import Effort
+from experiments.speed.products import multiply_adds, products
+from experiments.speed.timing import Timing, in_turn
+from experiments.speed.updates import updates
+from rewire_jax import runfolder
+from rewire_jax.errors import UserError
 from rewire_jax.methods.base import Spec
 from rewire_jax.plan import prepare
-from rewire_jax.presets import preset
-from rewire_jax.scenarios import make_scenario
 
 
-def test_quick_run_writes_every_figure(tmp_path, capsys):
-    out = tmp_path / "new" / "speed.json"
-    bench_speed.run(bench_speed.Bench(out=out, quick=True))
-    result = json.loads(out.read_text())
-    loops = result["loops"]
+def quick(folder, *parts):
+    job = bench_speed.Bench(parts=parts, out=folder, quick=True)
+    return {name: result["rows"] for name, result in bench_speed.run(job).items()}
+
+
+def test_updates_are_measured_against_products(tmp_path, capsys):
+    rows = {row["loop"]: row for row in quick(tmp_path / "new", "updates")["updates"]}
     plain = {"square", "shapes", "plain/2"}
-    assert set(loops) == plain | {"rewire/2"}
-    for name, figures in loops.items():
-        assert len(figures["seconds"]) == 2
-        assert figures["best"] >= figures["median"] > 0
-        assert ("multiply_adds" in figures) == (name in plain)
-        assert ("share" in figures) == (name in plain)
-        assert ("cost" in figures) == (name not in plain)
-    assert loops["square"]["share"] == 1
-    assert {"commit", "versions", "device", "load"} <= set(result)
-    assert result["options"]["modes"] == 3
+    assert set(rows) == plain | {"rewire/2"}
+    for name, row in rows.items():
+        assert len(row["seconds"]) == 2
+        assert row["best"] >= row["median"] > 0
+        assert ("multiply_adds" in row) == ("share" in row) == (name in plain)
+        assert ("cost" in row) == (name not in plain)
+    assert rows["square"]["share"] == 1
     printed = capsys.readouterr().out
-    assert str(out) in printed
-    assert all(name in printed for name in loops)
+    assert all(name in printed for name in rows)
+
+
+def test_a_part_is_measured_anew_and_the_others_are_kept(tmp_path):
+    kept = {"rows": [{"loop": "kept", "best": 2.0}], "seconds": 1.0, "load": [0.0, 0.0]}
+    kept |= {"rounds": 1, "provenance": runfolder.provenance()}
+    runfolder.write(tmp_path / "result.json", {"updates": kept})
+    rows = quick(tmp_path, "permutation")
+    assert rows["updates"] == kept["rows"]
+    assert "`kept`" in (tmp_path / "report.md").read_text()
+
+
+def test_an_unknown_part_is_refused(tmp_path):
+    with pytest.raises(UserError, match="choose from updates"):
+        quick(tmp_path, "colour")
+
+
+def test_ratios_are_medians_within_rounds():
+    # In the second round the machine was busy for both, in the third for one.
+    one, other = Timing(10, [1.0, 10.0, 1.0]), Timing(20, [4.0, 40.0, 400.0])
+    assert one.over(other) == pytest.approx((10 / 1) / (20 / 4))
+    assert one.best == 10
+    assert other.median == 0.5
+
+
+def test_loops_take_turns():
+    calls = []
+    loops = {name: lambda count, name=name: calls.append(name) for name in "ab"}
+    timings = in_turn(loops, rounds=3, seconds=1e-9)
+    assert calls[-6:] == ["a", "b"] * 3
+    assert all(timing.repeats % 2 == 0 for timing in timings.values())
 
 
 def test_multiply_adds_by_hand():
     spec = Spec(observations=2, actions=1, hidden=5, depth=1, tasks=1)
-    critics, policy = map(bench_speed.multiply_adds, bench_speed.products(spec, 7))
+    critics, policy = map(multiply_adds, products(spec, 7))
     p, c = 2 * 5 + 5 * 2, 3 * 5 + 5
     assert critics == 7 * (p + 2 * (4 * c - 3 * 5))
     assert policy == 7 * (3 * p - 2 * 5 + 2 * (2 * c - 2 * 5))
 
 
 def test_multiply_adds_are_those_of_the_compiled_update():
-    settings = preset(make_scenario(bench_speed.SCENARIO), "ft1")
-    sizes = replace(settings.sac, hidden=128, depth=2, batch_size=128)
-    settings = replace(settings, sac=sizes)
-    state, advance, batches = bench_speed.updates(settings)
+    settings = Effort().settings("ft1", hidden=128, depth=2, batch_size=128)
+    state, advance, batches = updates(settings)
     compiled = jax.jit(advance).lower(state, batches, 3).compile()
     # XLA counts the body of a loop once, of a branch the dearer side, and what is not
     # a matrix product too.
     counted = compiled.cost_analysis()["flops"]
-    critics, policy = bench_speed.products(prepare(settings).spec, 128)
-    expected = 2 * bench_speed.multiply_adds(critics + policy)
+    critics, policy = products(prepare(settings).spec, 128)
+    expected = 2 * multiply_adds(critics + policy)
     assert expected < counted < 1.15 * expected

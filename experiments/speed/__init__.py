@@ -1,0 +1,1 @@
+"""The parts of `experiments.bench_speed`, one a file."""

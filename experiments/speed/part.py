@@ -1,0 +1,69 @@
+"""What a part of the bench is, and how much of it is measured."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+
+from rewire_jax.config import Settings
+from rewire_jax.presets import preset
+from rewire_jax.scenarios import make_scenario
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured.
+
+    Attributes:
+      rounds: how often each loop is timed.
+      seconds: about how long each time.
+      quick: everything tiny, to see that it runs.
+    """
+
+    rounds: int = 12
+    seconds: float = 0.5
+    quick: bool = False
+
+    @property
+    def scenario(self) -> str:
+        """What is learned."""
+        return "probe/reach" if self.quick else "halfcheetah/forgetting"
+
+    def settings(self, method: str, **sac: Any) -> Settings:
+        """The paper's settings of a method, some of SAC's replaced."""
+        settings = preset(make_scenario(self.scenario), method)
+        if self.quick:
+            sac = {"hidden": 16, "depth": 1, "batch_size": 16} | sac
+            settings = replace(settings, envs=2, updates=2, interactions=256, warmup=2)
+        return replace(settings, sac=replace(settings.sac, **sac))
+
+
+class Part(NamedTuple):
+    """A part: how it is measured and shown.
+
+    Attributes:
+      title: above the table.
+      reading: below it, how to read it.
+      measure: gives the rows, ready for JSON.
+      columns: heading -> what a row shows there.
+      picture: title of the picture, and what draws it; None where there is none.
+    """
+
+    title: str
+    reading: str
+    measure: Callable[[Effort], list[Row]]
+    columns: Mapping[str, Callable[[Row], str]]
+    picture: tuple[str, Callable[[Axes, list[Row]], None]] | None = None
+
+
+def show(name: str, form: str = ",.3g") -> Callable[[Row], str]:
+    """A column: a number of the row, or a dash where it has none."""
+
+    def text(row: Row) -> str:
+        value = row.get(name)
+        return "–" if value is None else format(value, form)
+
+    return text

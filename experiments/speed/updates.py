@@ -1,0 +1,131 @@
+"""Updates a second against the machine's own rate for matrix products."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.products import SQUARE, multiply_adds, product_loop, products
+from experiments.speed.timing import Loop, in_turn
+from rewire_jax import sac
+from rewire_jax.config import Settings
+from rewire_jax.methods import find_method
+from rewire_jax.methods.base import Spec
+from rewire_jax.plan import prepare
+from rewire_jax.replay import Batch
+
+METHODS = {"plain": "ft1", "rewire": "rewire"}
+
+
+def draw_batches(spec: Spec, size: int) -> Batch:
+    """Batches `[32, size]` as the replay buffer gives them, of random numbers."""
+    o, shape = spec.observations, (32, size)
+    numbers = jax.random.normal(jax.random.key(1), (*shape, 2 * o + 1))
+    action, ended = jnp.tanh(numbers[..., : spec.actions]), jnp.zeros(shape, bool)
+    first, reward, second = numbers[..., :o], numbers[..., -1], numbers[..., o:-1]
+    return Batch(first, action, reward, ended, ended, second)
+
+
+def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
+    """A population of one in its second task, and its updates as training makes them.
+
+    Returns:
+      The population's state, a function `(state, batches, count) -> state` to be
+      compiled, and batches for it.
+    """
+    plan = prepare(settings)
+    spec, make = plan.spec, find_method(settings.method).make
+
+    def begin(member):
+        method = make(spec, member.options)
+        learner = sac.init(member.keys, method, spec, member.sac)
+        kept = method.end_task(learner.params, learner.memory, 0, None)
+        params, memory = method.start_task(member.keys, *kept, 1)
+        learner = learner._replace(params=params, memory=memory)
+        return member, sac.restart(learner, member.sac)
+
+    def advance(state, batches, count):
+        member, learner = state
+        method = make(spec, member.options)
+
+        def one(number, carry):
+            batch = jax.tree.map(lambda x: x[number % len(x)], batches)
+            key = jax.random.fold_in(member.keys, number)
+            learner, metrics = carry
+            return sac.update(learner, metrics, batch, key, number, method, member.sac)
+
+        first = jax.tree.map(lambda x: x[0], batches)
+        metrics = sac.policy_metrics(learner, first, method, member.sac)
+        metrics |= {"critic_loss": jnp.zeros(()), "q": jnp.zeros(())}
+        return member, jax.lax.fori_loop(0, count, one, (learner, metrics))[0]
+
+    state = jax.jit(jax.vmap(begin))(plan.members)
+    batches = draw_batches(spec, settings.sac.batch_size)
+    return state, jax.vmap(advance, (0, None, None)), batches
+
+
+def update_loop(settings: Settings) -> Loop:
+    """Makes updates in one compiled loop, each time going on from the last."""
+    state, advance, batches = updates(settings)
+    compiled = jax.jit(advance, donate_argnums=0)
+
+    def loop(count):
+        nonlocal state
+        state = compiled(state, batches, count)
+        return state[1].log_temperature
+
+    return loop
+
+
+def measure(effort: Effort) -> list[Row]:
+    """A row for each loop."""
+    settings = effort.settings("ft1")
+    spec, batch = prepare(settings).spec, settings.sac.batch_size
+    critics, policy = products(spec, batch)
+    loops, needed = {}, {}
+    for name, some in (("square", SQUARE), ("shapes", critics + policy)):
+        loops[name], needed[name] = product_loop(some), float(multiply_adds(some))
+    delays = (2,) if effort.quick else (2, 1)
+    for delay in delays:
+        sac = {"policy_delay": delay, "target_delay": delay}
+        for name, method in METHODS.items():
+            loops[f"{name}/{delay}"] = update_loop(effort.settings(method, **sac))
+        whole = multiply_adds(critics) + multiply_adds(policy) / delay
+        needed[f"plain/{delay}"] = whole
+    timings = in_turn(loops, effort.rounds, effort.seconds)
+    rows = []
+    for name, timing in timings.items():
+        row = {"loop": name, "batch": batch, **spec._asdict(), **timing.figures()}
+        if name in needed:
+            share = timing.over(timings["square"]) * needed[name] / needed["square"]
+            row |= {"multiply_adds": needed[name], "share": share}
+        if name.startswith("rewire/"):
+            row["cost"] = timings[name.replace("rewire", "plain")].over(timing)
+        rows.append(row)
+    return rows
+
+
+def _flops(row: Row) -> str:
+    return (
+        f"{2e-9 * row['multiply_adds'] * row['best']:,.0f}" if "share" in row else "–"
+    )
+
+
+PART = Part(
+    title="Updates a second, against matrix products",
+    reading="`square` is a product of 256 × 256 matrices, `shapes` are all the "
+    "products of a plain update in their own shapes; `plain/2` and `rewire/2` are "
+    "updates with the policy at every second one, `plain/1` and `rewire/1` at each. "
+    "The share is that of the rate of `square`, the cost in plain updates.",
+    measure=measure,
+    columns={
+        "loop": lambda row: f"`{row['loop']}`",
+        "a second, best": show("best"),
+        "median": show("median"),
+        "GFLOP/s": _flops,
+        "share": show("share", ".0%"),
+        "cost": show("cost", ".2f"),
+    },
+)
