@@ -1,5 +1,6 @@
 """A continual run: task after task, evaluation, logging, checkpoints."""
 
+import functools
 import signal
 import time as clock
 from collections.abc import Callable, Iterator
@@ -119,27 +120,17 @@ class Run:
         if program.candidates is None or not rows:
             return None, now.selection
         candidates = program.candidates(self.plan.members, learner, now.stage)
-        number = candidates.valid.shape[1]
-        # Rows beyond the candidates are filled, and what happens there is left out.
-        turn = np.arange(rows) % number
         result = program.rollout(
-            jax.tree.map(lambda leaf: jnp.stack([leaf] * rows), task),
-            jax.tree.map(lambda leaf: leaf[:, turn], candidates.policies),
+            jax.tree.map(lambda leaf: np.stack([leaf] * rows), task),
+            _fill(candidates.policies, rows),
             self.keys(_SELECTION, 2 * now.stage + phase, rows),
             self.plan.settings.selection_episodes,
         )
-        used = result.lengths[:, :number].sum(axis=2) * candidates.valid
-        return result.returns[:, :number].mean(axis=2), now.selection + used.sum(axis=1)
+        return _judge(result, candidates.valid, now.selection)
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""
-
-        def split(key):
-            key = jax.random.fold_in(jax.random.fold_in(key, stream), number)
-            # Unlike those of a split, the first do not depend on how many there are.
-            return jax.vmap(lambda row: jax.random.fold_in(key, row))(np.arange(rows))
-
-        return jax.vmap(split)(self.plan.members.keys)
+        return _make_keys(self.plan.members.keys, stream, number, rows)
 
     def chunk(self, now: Standing, task: Task) -> Standing:
         """Trains until the next progress report."""
@@ -315,6 +306,7 @@ class Run:
         if self.choosing:
             scores["choice"] = play(_CHOICE)["return"]
         sizes = np.asarray(program.size(members, now.learner))
+        selection = np.asarray(now.selection)
         rows = [
             {
                 "stage": stage,
@@ -325,7 +317,7 @@ class Run:
                 "episodes": settings.eval_episodes,
                 "interactions": {
                     "training": (stage + 1) * plan.interactions,
-                    "selection": int(now.selection[place]),
+                    "selection": int(selection[place]),
                 },
                 "diverged": not bool(now.alive[place]),
                 "model_size": int(sizes[place]) / base_size(plan.spec),
@@ -338,6 +330,34 @@ class Run:
         for row in rows:
             self.events.evaluation(row)
         return scores["return"][: len(plan.crowd)]
+
+
+@functools.partial(jax.jit, static_argnames="rows")
+def _make_keys(keys: jax.Array, stream: int, number: int, rows: int) -> jax.Array:
+    """Keys `[members, rows]` for a number in a stream, from `[members]`."""
+
+    def split(key):
+        key = jax.random.fold_in(jax.random.fold_in(key, stream), number)
+        # Unlike those of a split, the first do not depend on how many there are.
+        return jax.vmap(lambda row: jax.random.fold_in(key, row))(jnp.arange(rows))
+
+    return jax.vmap(split)(keys)
+
+
+@functools.partial(jax.jit, static_argnames="rows")
+def _fill(policies: Any, rows: int) -> Any:
+    """Policies `[members, candidates]` in so many rows, over and over."""
+    return jax.tree.map(lambda leaf: leaf[:, np.arange(rows) % leaf.shape[1]], policies)
+
+
+@jax.jit
+def _judge(
+    result: rollout.Rollout, valid: jax.Array, selection: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What `Run.select` returns, from what the candidates did in the first rows."""
+    number = valid.shape[1]
+    used = result.lengths[:, :number].sum(axis=2) * valid
+    return result.returns[:, :number].mean(axis=2), selection + used.sum(axis=1)
 
 
 def _finite(value: float | None) -> float | None:

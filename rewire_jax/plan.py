@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh
 
 from rewire_jax import config, networks, population, program, training
@@ -24,7 +24,7 @@ class Plan(NamedTuple):
     Attributes:
       settings: checked and complete.
       scenario: as it was made.
-      tasks: of the sequence that is run, stacked on a leading axis.
+      tasks: of the sequence that is run, stacked on a leading axis, on the host.
       names: of these tasks.
       crowd: the members.
       steps: steps of all environments in a task.
@@ -154,7 +154,7 @@ def prepare(
     return Plan(
         settings=settings,
         scenario=scenario,
-        tasks=jax.tree.map(lambda *x: jnp.stack(x), *[t.data for t in sequence]),
+        tasks=jax.tree.map(lambda *x: np.stack(x), *[t.data for t in sequence]),
         names=tuple(task.name for task in sequence),
         crowd=tuple(crowd),
         steps=budget // round_ * settings.update_every,

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -57,17 +58,19 @@ def cross(
     )
 
 
+_make_keys = jax.jit(jax.vmap(jax.random.key))
+
+
 def stack(crowd: Sequence[Member]) -> Members:
     """Members side by side; they may differ only in their traced numbers."""
 
     def stacked(settings):
         return jax.tree.map(
-            lambda *leaves: jnp.asarray(leaves, jnp.result_type(*leaves)), *settings
+            lambda *leaves: np.asarray(leaves, jnp.result_type(*leaves)), *settings
         )
 
-    seeds = jnp.asarray([member.seed for member in crowd], jnp.uint32)
     return Members(
-        keys=jax.vmap(jax.random.key)(seeds),
+        keys=_make_keys(np.array([member.seed for member in crowd], np.uint32)),
         sac=stacked([member.sac for member in crowd]),
         options=stacked([member.options for member in crowd]),
     )

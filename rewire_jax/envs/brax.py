@@ -63,7 +63,7 @@ def _make_domain(name: str, backend: str) -> Domain:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Brax System", UserWarning)
         env = brax.envs.get_environment(name, backend=backend)
-    env.sys = system = _normalize(env.sys, backend)
+    system = _normalize(env.sys, backend)
     environment = _make_environment(env)
     bodies = _body_ids(system.mj_model)
     joints = [
@@ -119,9 +119,10 @@ def _make_environment(env: PipelineEnv) -> Environment:
         )
 
     observation = jax.eval_shape(lambda key: env.reset(key).obs, jax.random.key(0))
+    # Tracing these takes seconds: done once for all functions that call them.
     return Environment(
-        reset=reset,
-        step=step,
+        reset=jax.jit(reset),
+        step=jax.jit(step),
         observation_size=observation.shape[0],
         action_size=env.action_size,
         episode_length=EPISODE_LENGTH,
@@ -129,15 +130,16 @@ def _make_environment(env: PipelineEnv) -> Environment:
 
 
 def _normalize(system: System, backend: str) -> System:
-    """Makes every leaf an array and the masses those that act."""
+    """Makes every leaf an array on the host and the masses those that act."""
     changed: dict[str, Any] = {"tex_data": np.zeros(0, np.uint8)}  # half a megabyte
     if backend in ("positional", "spring"):
         # These two raise each mass to 1 - spring_mass_scale (Ant: to 0) before
         # they use it, which would shrink a body factor or undo it.
         mass = system.link.inertia.mass ** (1 - system.spring_mass_scale)
         changed |= {"link.inertia.mass": mass, "spring_mass_scale": 0.0}
+    # On a device the changes below would be compiled, one by one.
     return jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)),
+        lambda leaf: np.asarray(leaf, jnp.result_type(leaf)),
         system.tree_replace(changed),
     )
 
@@ -186,6 +188,8 @@ def _change_system(
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
     size = system.geom_size
+    scale = np.ones_like(size)
+    scale[:, 0] = radius
     new = {
         "gravity": system.gravity * change.gravity,
         "opt.gravity": system.opt.gravity * change.gravity,
@@ -194,7 +198,7 @@ def _change_system(
         "geom_friction": system.geom_friction * change.friction,
         # The radius only: a capsule keeps the distance between its ends. The
         # bound of a capsule or a sphere grows as its radius does.
-        "geom_size": size.at[:, 0].multiply(radius),
+        "geom_size": size * scale,
         "geom_rbound": system.geom_rbound + size[:, 0] * (radius - 1),
         "link.inertia.mass": system.link.inertia.mass * mass[1:],
         "body_mass": model.body_mass,
@@ -206,5 +210,7 @@ def _change_system(
         "stat.meaninertia": model.stat.meaninertia,
     }
     # A new array for each: MuJoCo's are views of a model that dies here.
-    changed = system.tree_replace({k: jnp.array(v) for k, v in new.items()})
-    return jax.tree.map(lambda x, old: x.astype(old.dtype), changed, system)
+    changed = system.tree_replace({k: np.array(v) for k, v in new.items()})
+    return jax.tree.map(
+        lambda x, old: jnp.asarray(x.astype(old.dtype)), changed, system
+    )

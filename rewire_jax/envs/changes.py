@@ -27,9 +27,8 @@ def action_scale(joints: Sequence[str], factors: Mapping[str, float]) -> jax.Arr
     """
     check_names("joint", factors, [*joints, ALL_JOINTS])
     everywhere = factors.get(ALL_JOINTS, 1.0)
-    return jnp.asarray(
-        [everywhere * factors.get(joint, 1.0) for joint in joints], jnp.float32
-    )
+    scale = [everywhere * factors.get(joint, 1.0) for joint in joints]
+    return jnp.asarray(np.array(scale, np.float32))
 
 
 def observation_mask(size: int, hidden: float) -> jax.Array:
@@ -52,7 +51,8 @@ def observation_mask(size: int, hidden: float) -> jax.Array:
         raise UserError(f"hidden must be a share in [0, 1], not {hidden}.")
     zeros = int(hidden * size)
     mask = np.repeat([0.0, 1.0], [zeros, size - zeros])
-    return jnp.asarray(np.random.RandomState(0).permutation(mask), jnp.float32)
+    drawn = np.random.RandomState(0).permutation(mask)
+    return jnp.asarray(drawn.astype(np.float32))
 
 
 def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
