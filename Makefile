@@ -8,6 +8,10 @@ EXTRAS := dev
 %-mjx %-mjx/.installed: VENV := .venv-mjx
 %-mjx %-mjx/.installed: PINS := constraints-mjx.txt
 %-mjx %-mjx/.installed: EXTRAS := cw-mjx,test
+# What ends in -bench has one with other implementations, to measure beside ours.
+%-bench %-bench/.installed: VENV := .venv-bench
+%-bench %-bench/.installed: PINS := constraints-bench.txt
+%-bench %-bench/.installed: EXTRAS := bench,test
 
 # Deferred: Python is looked for only where it is used.
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
@@ -21,17 +25,19 @@ option = $(if $(strip $(2)),--$(1) $(2))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup setup-mjx lock lock-mjx lint format test test-slow test-mjx \
-	bench-brax bench-cw bench-speed bench-mjx readme clean
+.PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
+	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 	@echo 'bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS TASKS' \
-		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too.'
+		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS.'
 
 setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
 
 setup-mjx: .venv-mjx/.installed ## Make .venv-mjx: Meta-World on MJX-Warp instead of C MuJoCo
+
+setup-bench: .venv-bench/.installed ## Make .venv-bench: with what bench-speed compares to
 
 # An environment that can run pip is kept, anything else is made anew.
 define make_venv
@@ -46,7 +52,8 @@ endef
 
 .venv/.installed: constraints.txt
 .venv-mjx/.installed: constraints-mjx.txt
-.venv/.installed .venv-mjx/.installed: pyproject.toml
+.venv-bench/.installed: constraints-bench.txt
+.venv/.installed .venv-mjx/.installed .venv-bench/.installed: pyproject.toml
 	$(make_venv)
 	$(RUN) -m pip install --quiet --disable-pip-version-check \
 		-c $(PINS) -e '.[$(EXTRAS)]'
@@ -55,7 +62,8 @@ endef
 # Pins that are there stay; `make lock UPGRADE=1` looks for newer versions.
 lock: ## Resolve the dependencies anew into constraints.txt (UPGRADE=1: newest)
 lock-mjx: ## The same into constraints-mjx.txt
-lock lock-mjx:
+lock-bench: ## The same into constraints-bench.txt
+lock lock-mjx lock-bench:
 	$(make_venv)
 	$(RUN) -m pip install --quiet --disable-pip-version-check \
 		--dry-run --ignore-installed --report $(VENV)/lock.json \
@@ -70,7 +78,8 @@ print(f"# The versions that are tested together. Made by `make {sys.argv[1]}`: d
 packages = [item["metadata"] for item in json.load(sys.stdin)["install"]]
 for package in sorted(packages, key=lambda package: package["name"].lower()):
     if package["name"] != "rewire_jax":
-        print(package["name"] + "==" + package["version"])
+        # A build's own suffix, as of PyTorch for a CPU, is not found everywhere.
+        print(package["name"] + "==" + package["version"].split("+")[0])
 endef
 export LOCK
 
@@ -92,6 +101,9 @@ test-slow: setup ## Run the slow tests
 test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (compiles for minutes at first)
 	$(RUN) -m pytest tests/test_metaworld_mjx.py
 
+test-bench: setup-bench ## Run the tests of what bench-speed compares to
+	$(RUN) -m pytest tests/test_bench_peers.py
+
 bench_options = $(strip \
 	$(call option,scenario,$(SCENARIO)) \
 	$(call option,methods,$(subst $(comma), ,$(METHODS))) \
@@ -112,8 +124,9 @@ bench-cw: setup ## The same on a Continual World scenario (TRANSFER=1: and each 
 		$(call option,reward,$(REWARD)) \
 		$(if $(TRANSFER),--transfer))
 
-bench-speed: setup ## Measure interactions and updates a second
-	$(RUN) -m experiments.bench_speed
+bench-speed: setup ## Measure what is fast and slow, and peers after setup-bench
+	$(if $(wildcard .venv-bench/.installed),.venv-bench/bin/python,$(RUN)) \
+		-m experiments.bench_speed $(call option,parts,$(subst $(comma), ,$(PARTS)))
 
 bench-mjx: setup-mjx ## Measure steps a second of Meta-World on MJX-Warp
 	$(RUN) -m experiments.bench_mjx

@@ -17,6 +17,7 @@ import jax
 from experiments import suite
 from experiments.speed import (
     environments,
+    loops,
     members,
     permutation,
     sizes,
@@ -33,6 +34,7 @@ PARTS: dict[str, Part] = {
     "sizes": sizes.PART,
     "permutation": permutation.PART,
     "environments": environments.PART,
+    "loops": loops.PART,
     "members": members.PART,
     "startup": startup.PART,
 }

@@ -1,7 +1,13 @@
+import functools
+import time
+
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from experiments import bench_speed
+from experiments.speed import loops, permutation
 from experiments.speed.part import Effort
 from experiments.speed.products import multiply_adds, products
 from experiments.speed.timing import Timing, in_turn
@@ -15,6 +21,10 @@ from rewire_jax.plan import prepare
 def quick(folder, *parts):
     job = bench_speed.Bench(parts=parts, out=folder, quick=True)
     return {name: result["rows"] for name, result in bench_speed.run(job).items()}
+
+
+def nothing(count):
+    time.sleep(1e-4 * count)
 
 
 def test_updates_are_measured_against_products(tmp_path, capsys):
@@ -55,8 +65,13 @@ def test_ratios_are_medians_within_rounds():
 
 def test_loops_take_turns():
     calls = []
-    loops = {name: lambda count, name=name: calls.append(name) for name in "ab"}
-    timings = in_turn(loops, rounds=3, seconds=1e-9)
+
+    def loop(name, count):
+        calls.append(name)
+        nothing(count)
+
+    both = {name: functools.partial(loop, name) for name in "ab"}
+    timings = in_turn(both, rounds=3, seconds=1e-3)
     assert calls[-6:] == ["a", "b"] * 3
     assert all(timing.repeats % 2 == 0 for timing in timings.values())
 
@@ -79,3 +94,57 @@ def test_multiply_adds_are_those_of_the_compiled_update():
     critics, policy = products(prepare(settings).spec, 128)
     expected = 2 * multiply_adds(critics + policy)
     assert expected < counted < 1.15 * expected
+
+
+def test_environments_and_permutation_have_a_row_for_each_case(tmp_path):
+    rows = quick(tmp_path, "permutation", "environments")
+    assert [row["hidden"] for row in rows["permutation"]] == [8, 16]
+    one, four = rows["environments"]
+    assert (one["count"], four["count"]) == (1, 4)
+    assert one["gain"] == 1
+    assert four["steps_per_second"] == pytest.approx(4 * four["best"])
+    text = (tmp_path / "report.md").read_text()
+    for name in rows:
+        assert f"({name}.png)" in text
+        assert (tmp_path / f"{name}.png").stat().st_size > 1000
+
+
+def test_the_dense_form_is_the_permutation():
+    key = jax.random.key(0)
+    x, scores = jax.random.normal(key, (5, 9)), jax.random.uniform(key, (9,))
+
+    def loss(function):
+        return lambda x, scores: jnp.sum(jnp.sin(function(x, scores, 0.2)))
+
+    for argument in (0, 1):
+        dense, ours = (
+            jax.grad(loss(function), argument)(x, scores)
+            for function in (permutation.dense, permutation.permute)
+        )
+        np.testing.assert_allclose(dense, ours, atol=1e-5)
+
+
+def test_peers_that_are_not_there_are_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(loops, "version", lambda package: None)
+    monkeypatch.setattr(loops, "make", lambda *_: (nothing, nothing))
+    rows = quick(tmp_path, "loops")["loops"]
+    assert {row["name"] for row in rows} == {loops.OURS, *loops.PEERS}
+    text = (tmp_path / "report.md").read_text()
+    assert text.count("| not installed |") == 1 + sum(
+        len(peer.cases) for peer in loops.PEERS.values()
+    )
+
+
+def test_where_a_peer_is_ahead_the_table_says_so():
+    row = {"name": "SBX", "whole_ratios": {"plain": 1.25, "rewire": 0.75}}
+    assert loops.PART.columns["our plain loop"](row) == "1.25"
+    assert loops.PART.columns["our rewire loop"](row) == "**0.75**"
+
+
+@pytest.mark.slow
+def test_all_parts_run(tmp_path):
+    rows = quick(tmp_path)
+    assert set(rows) == set(bench_speed.PARTS)
+    assert [row["cache"] for row in rows["startup"]] == ["empty", "filled"]
+    assert rows["startup"][1]["share"] < 1
+    assert rows["loops"][0]["whole_ratios"]["rewire"] == 1

@@ -1,0 +1,206 @@
+"""Whole loops, environments and updates, and updates alone; peers beside ours.
+
+Peers learn on our environments with our sizes. Those that are not installed are named
+all the same.
+"""
+
+import importlib
+import importlib.metadata
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+
+from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.timing import Loop, Timing, in_turn
+from experiments.speed.updates import METHODS, draw_batches, update_loop
+from rewire_jax import figures
+from rewire_jax.config import Settings
+from rewire_jax.plan import prepare
+from rewire_jax.replay import Batch
+from rewire_jax.scenarios import make_scenario
+
+OURS = "rewire_jax"
+
+
+class Case(NamedTuple):
+    """Something that is timed.
+
+    Attributes:
+      name: whose.
+      policy: "plain" or "rewire".
+      delay: updates for each update of the policy.
+    """
+
+    name: str
+    policy: str
+    delay: int
+
+
+class Peer(NamedTuple):
+    """Another implementation.
+
+    Attributes:
+      module: file beside this one, with `update_loop` and `whole_loop`.
+      package: what must be installed.
+      cases: policies and delays that it has.
+    """
+
+    module: str
+    package: str
+    cases: tuple[tuple[str, int], ...]
+
+
+PEERS = {
+    "SBX": Peer("peer_sbx", "sbx-rl", (("plain", 2), ("plain", 1))),
+    "rejax": Peer("peer_rejax", "rejax", (("plain", 1),)),
+    "PyTorch": Peer("peer_torch", "torch", (("plain", 2), ("rewire", 2))),
+}
+
+
+def version(package: str) -> str | None:
+    """That of a package, None where it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def whole_loop(settings: Settings) -> Loop:
+    """Steps of all our environments with all their updates, in a second task."""
+    plan = prepare(settings)
+    program, members = plan.program, plan.members
+    first, second = (jax.tree.map(lambda x, i=i: x[i], plan.tasks) for i in range(2))
+    alive = np.ones(plan.places, bool)
+    state = program.begin(members, program.init(members), alive, 0, first)
+    learner = program.finish(members, state.learner, 0, None)
+    state = program.begin(members, learner, alive, 1, second)
+    done = 0
+
+    def loop(count):
+        nonlocal state, done
+        state, report = program.chunk(members, state, 1, second, done, count)
+        done += count
+        return report
+
+    jax.block_until_ready(loop(settings.warmup // settings.envs + 1))
+    return loop
+
+
+def settings_of(effort: Effort, case: Case) -> Settings:
+    """Everybody's sizes; few interactions come before the first updates."""
+    delays = {"policy_delay": case.delay, "target_delay": case.delay}
+    settings = effort.settings(METHODS[case.policy], **delays)
+    return replace(settings, warmup=10 * settings.envs)
+
+
+def make(effort: Effort, case: Case, batches: Batch) -> tuple[Loop, Loop]:
+    """The whole loop of a case, and its updates from all the batches."""
+    settings = settings_of(effort, case)
+    if case.name == OURS:
+        update, size = update_loop(settings), len(batches.reward)
+        return whole_loop(settings), lambda count: update(count * size)
+    scenario = make_scenario(effort.scenario)
+    environment, task = scenario.environment, scenario.tasks[1].data
+    # Not before it is asked for: not everybody has it.
+    peer = importlib.import_module(f"experiments.speed.{PEERS[case.name].module}")
+    return (
+        peer.whole_loop(settings, environment, task),
+        peer.update_loop(settings, environment, task, batches),
+    )
+
+
+def measure(effort: Effort) -> list[Row]:
+    """A row for each implementation, policy and delay."""
+    cases = [Case(OURS, policy, delay) for delay in (2, 1) for policy in METHODS]
+    if effort.quick:
+        cases = [Case(OURS, "rewire", 2)]
+    missing = []
+    for name, peer in PEERS.items():
+        own = [Case(name, *what) for what in peer.cases]
+        if version(peer.package) is None or effort.quick:
+            missing += own
+        else:
+            cases += own
+    settings = settings_of(effort, cases[0])
+    batches = draw_batches(prepare(settings).spec, settings.sac.batch_size)
+    loops = {case: make(effort, case, batches) for case in cases}
+    rounds, seconds = min(effort.rounds, 5), effort.seconds
+    whole = in_turn({case: loops[case][0] for case in cases}, rounds, 2 * seconds)
+    alone = in_turn({case: loops[case][1] for case in cases}, rounds, seconds)
+    rows = []
+    for case in cases:
+        package = PEERS[case.name].package if case.name in PEERS else OURS
+        rows.append(
+            {
+                **case._asdict(),
+                "version": version(package),
+                "interactions_per_second": settings.envs * whole[case].best,
+                "updates_per_second": len(batches.reward) * alone[case].best,
+                "whole": whole[case].figures(),
+                "alone": alone[case].figures(),
+                "whole_ratios": ratios(whole, case),
+                "alone_ratios": ratios(alone, case),
+            }
+        )
+    return rows + [case._asdict() for case in missing]
+
+
+def ratios(timings: dict[Case, Timing], case: Case) -> Row:
+    """How often ours repeats while a case does once, with the same delay."""
+    return {
+        policy: timings[ours].over(timings[case])
+        for policy in METHODS
+        if (ours := Case(OURS, policy, case.delay)) in timings
+    }
+
+
+def draw(axes: Axes, rows: list[Row]) -> None:
+    """Interactions a second."""
+    rows = [row for row in rows if "whole" in row]
+    names = [f"{row['name']}, {row['policy']}, {row['delay']}" for row in rows]
+    rates = [row["interactions_per_second"] for row in rows]
+    colours = [figures.look(int(row["name"] != OURS))["color"] for row in rows]
+    axes.barh(names, rates, color=colours)
+    axes.invert_yaxis()
+    axes.set_xlabel("interactions a second, with all their updates")
+
+
+def _ratio(what: str, policy: str) -> Callable[[Row], str]:
+    def text(row: Row) -> str:
+        ratio = row.get(f"{what}_ratios", {}).get(policy)
+        if ratio is None or row["name"] == OURS:
+            return "–"
+        return f"{ratio:.2f}" if ratio >= 1 else f"**{ratio:.2f}**"
+
+    return text
+
+
+PART = Part(
+    title="Whole loops, and peers",
+    reading="HalfCheetah, positional, 128 environments, 64 updates after each of their "
+    "steps, networks of 3 × 256, batches of 256. The last four columns say how often "
+    "ours repeats while the other does once, with a policy update as often; in bold "
+    "where the other is ahead. SBX's and PyTorch's learners are in the host's hands "
+    "and step the same compiled environments by a call each; rejax is compiled as a "
+    "whole. rejax has no delayed policy updates. PyTorch's is written for this, "
+    "`rewire` with straight-through SoftSort matrices. `make setup-bench` installs the "
+    "peers.",
+    measure=measure,
+    columns={
+        "implementation": lambda row: row["name"],
+        "version": lambda row: row.get("version") or "not installed",
+        "policy": lambda row: row["policy"],
+        "updates to one of the policy": show("delay", "d"),
+        "interactions a second": show("interactions_per_second", ",.0f"),
+        "updates a second": show("updates_per_second", ",.0f"),
+        "our plain loop": _ratio("whole", "plain"),
+        "our rewire loop": _ratio("whole", "rewire"),
+        "our plain updates": _ratio("alone", "plain"),
+        "our rewire updates": _ratio("alone", "rewire"),
+    },
+    picture=("Whole loops: implementation, policy, updates to one of the policy", draw),
+)
