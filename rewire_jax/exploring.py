@@ -43,9 +43,10 @@ def explore(
     context = method.context(context_key, memory, "act", label)
     mean, log_std = method.distribution(params, memory, context, observation)
     if sequence is None:
-        action, _ = networks.sample_action(action_key, mean, log_std)
+        drawn = jax.random.normal(action_key, mean.shape, mean.dtype)
     else:
-        action = jnp.tanh(mean + jnp.exp(log_std) * sequence[time % len(sequence)])
+        drawn = sequence[time % len(sequence)]
+    action, _ = networks.sample_action(drawn, mean, log_std)
     if random:
         uniform = jax.random.uniform(random_key, action.shape, minval=-1.0)
         action = jnp.where(time < random, uniform, action)

@@ -148,6 +148,8 @@ def build(
     def polish(member, state, index, time, done, steps):
         update = functools.partial(
             training.learn,
+            due=True,
+            updates=shape.updates,
             environment=environment,
             method=make(spec, member.options),
             settings=member.sac,
@@ -157,7 +159,7 @@ def build(
         def step(number, state):
             first = number * shape.updates
             step_key = jax.random.fold_in(key, number)
-            return update(step_key, state, time, first, shape.updates)[0]
+            return update(step_key, state, time, first)[0]
 
         return jax.lax.fori_loop(done, done + steps, step, state)
 

@@ -127,22 +127,42 @@ def add(
     )
 
 
-def sample(
-    replay: Replay, key: jax.Array, time: jax.Array, batch: int, episode_length: int
-) -> Batch:
-    """Draws transitions uniformly, with replacement.
+def draw(
+    replay: Replay, key: jax.Array, time: jax.Array, shape: tuple[int, ...]
+) -> jax.Array:
+    """Places of transitions, uniform with replacement, as `take` takes them.
 
     Args:
       replay: the buffer.
       key: a random key.
       time: `[]` int, the number of time steps stored so far, at least 1.
-      batch: how many transitions.
-      episode_length: as in `create`.
+      shape: of the result.
     """
     rows, envs = replay.reward.shape
     filled = jnp.minimum(time, rows - 1)
-    drawn = jax.random.randint(key, (batch,), 0, filled * envs)
-    at, env = time - 1 - drawn // envs, drawn % envs
+    return jax.random.randint(key, shape, 0, filled * envs)
+
+
+def labels(replay: Replay, places: jax.Array, time: jax.Array) -> Any:
+    """What was stored beside the transitions at some places, see `take`."""
+    rows, envs = replay.reward.shape
+    row = (time - 1 - places // envs) % rows
+    return jax.tree.map(lambda a: a[row, places % envs], replay.label)
+
+
+def take(
+    replay: Replay, places: jax.Array, time: jax.Array, episode_length: int
+) -> Batch:
+    """The transitions at some places, counted from the latest back.
+
+    Args:
+      replay: the buffer.
+      places: `[batch]` int, less than the number of transitions held.
+      time: `[]` int, the number of time steps stored so far, at least 1.
+      episode_length: as in `create`.
+    """
+    rows, envs = replay.reward.shape
+    at, env = time - 1 - places // envs, places % envs
     row = at % rows
     cut = (at // episode_length) % replay.final.shape[0]
     truncated = replay.truncated[row, env]
@@ -157,5 +177,12 @@ def sample(
             replay.final[cut, env],
             replay.observation[(row + 1) % rows, env],
         ),
-        label=jax.tree.map(lambda a: a[row, env], replay.label),
+        label=labels(replay, places, time),
     )
+
+
+def sample(
+    replay: Replay, key: jax.Array, time: jax.Array, batch: int, episode_length: int
+) -> Batch:
+    """`batch` transitions, uniform with replacement; see `draw` and `take`."""
+    return take(replay, draw(replay, key, time, (batch,)), time, episode_length)

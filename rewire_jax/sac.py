@@ -1,5 +1,6 @@
 """Soft Actor-Critic: losses and one update, for one member."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -79,13 +80,49 @@ def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
     return jax.vmap(networks.mlp, (0, None))(critic, inputs)[..., 0]
 
 
-def _critic_loss(critic, learner, batch, key, method, sac):
-    context_key, action_key = jax.random.split(key)
-    context = method.context(context_key, learner.memory, "critic", batch.label)
+class Draw(NamedTuple):
+    """What an update leaves to chance.
+
+    Attributes:
+      contexts: the method's, for the critics and for the policy.
+      noise: `[2, batch, actions]`, of these two's actions.
+      penalty: a key for the method's penalty.
+    """
+
+    contexts: tuple[Any, Any]
+    noise: jax.Array
+    penalty: jax.Array
+
+
+def draw(
+    key: jax.Array, memory: Memory, label: Any, size: tuple[int, int], method: Method
+) -> Draw:
+    """A draw for one update.
+
+    Args:
+      key: a random key.
+      memory: the method's, which updates leave as it is.
+      label: of the update's transitions.
+      size: of its actions, `batch, actions`.
+      method: the method.
+    """
+    critic_key, policy_key, noise_key, penalty_key = jax.random.split(key, 4)
+    return Draw(
+        contexts=(
+            method.context(critic_key, memory, "critic", label),
+            method.context(policy_key, memory, "policy", label),
+        ),
+        noise=jax.random.normal(noise_key, (2, *size)),
+        penalty=penalty_key,
+    )
+
+
+def _critic_loss(critic, learner, batch, draw, method, sac):
+    context = draw.contexts[0]
     mean, log_std = method.distribution(
         learner.params, learner.memory, context, batch.next_observation
     )
-    action, log_density = networks.sample_action(action_key, mean, log_std)
+    action, log_density = networks.sample_action(draw.noise[0], mean, log_std)
     following = method.critic_input(context, batch.next_observation)
     q_next = jnp.min(q_values(learner.target, following, action), axis=0)
     soft_value = q_next - jnp.exp(learner.log_temperature) * log_density
@@ -100,18 +137,16 @@ def _critic_loss(critic, learner, batch, key, method, sac):
     return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
 
 
-def _policy_loss(params, learner, batch, key, method):
-    context_key, action_key, penalty_key = jax.random.split(key, 3)
-    memory = learner.memory
-    context = method.context(context_key, memory, "policy", batch.label)
+def _policy_loss(params, learner, batch, draw, method):
+    memory, context = learner.memory, draw.contexts[1]
     gaussian = method.distribution(params, memory, context, batch.observation)
-    action, log_density = networks.sample_action(action_key, *gaussian)
+    action, log_density = networks.sample_action(draw.noise[1], *gaussian)
     inputs = method.critic_input(context, batch.observation)
     q = jnp.min(q_values(learner.critic, inputs, action), axis=0)
     entropy = -jnp.mean(log_density)
     loss = -jnp.exp(learner.log_temperature) * entropy - jnp.mean(q)
     penalty, metrics = method.penalty(
-        penalty_key, params, memory, context, batch.observation, gaussian
+        draw.penalty, params, memory, context, batch.observation, gaussian
     )
     return loss + penalty, {"policy_loss": loss, "entropy": entropy} | metrics
 
@@ -129,9 +164,9 @@ class _Actor(NamedTuple):
     optimizers: tuple[Any, Any]
 
 
-def _update_policy(actor, learner, batch, key, method, sac):
+def _update_policy(actor, learner, batch, draw, method, sac):
     gradient, metrics = jax.grad(_policy_loss, has_aux=True)(
-        actor.params, learner, batch, key, method
+        actor.params, learner, batch, draw, method
     )
     policy_state, temperature_state = actor.optimizers
     updates, policy_state = _step(gradient, policy_state, actor.params, sac.lr_policy)
@@ -160,21 +195,32 @@ def _actor(learner: Learner) -> _Actor:
     )
 
 
-def policy_metrics(learner: Learner, batch: Batch, method: Method, sac: SacSettings):
-    """Zeros in the shape of a policy update's metrics, to carry through a loop."""
+def no_metrics(
+    learner: Learner, batch: Batch, draw: Draw, method: Method, sac: SacSettings
+) -> Metrics:
+    """Zeros in the shape of an update's metrics, to carry through a loop."""
     shapes = jax.eval_shape(
-        lambda: _update_policy(
-            _actor(learner), learner, batch, jax.random.key(0), method, sac
-        )[1]
+        lambda: _update_policy(_actor(learner), learner, batch, draw, method, sac)[1]
     )
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return {
+        "critic_loss": jnp.zeros(()),
+        "q": jnp.zeros(()),
+        **jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes),
+    }
+
+
+def _every(delay, count, change, keep, value):
+    """What becomes of a value that only every so many-th update changes."""
+    if delay == 1:  # a branch would copy
+        return change(value)
+    return jax.lax.cond(count % delay == 0, change, keep, value)
 
 
 def update(
     learner: Learner,
     metrics: Metrics,
     batch: Batch,
-    key: jax.Array,
+    draw: Draw,
     count: jax.Array,
     method: Method,
     sac: SacSettings,
@@ -185,32 +231,33 @@ def update(
       learner: the member's learner.
       metrics: of the previous update, kept where this one makes none.
       batch: `[batch, ...]` transitions.
-      key: a random key.
+      draw: what is left to chance.
       count: `[]` int, updates made before in this task; it must be shared by all
         members of a population, so that the delayed updates stay real branches.
       method: the method.
       sac: SAC's settings.
     """
-    critic_key, policy_key = jax.random.split(key)
     (loss, q), gradient = jax.value_and_grad(_critic_loss, has_aux=True)(
-        learner.critic, learner, batch, critic_key, method, sac
+        learner.critic, learner, batch, draw, method, sac
     )
     _, critic_state, _ = learner.optimizers
     step, critic_state = _step(gradient, critic_state, learner.critic, sac.lr_critic)
     critic = optax.apply_updates(learner.critic, step)
     learner = learner._replace(critic=critic)
     # Only what a branch changes goes through it: the rest would be copied.
-    actor, policy = jax.lax.cond(
-        count % sac.policy_delay == 0,
-        lambda actor: _update_policy(actor, learner, batch, policy_key, method, sac),
+    actor, policy = _every(
+        sac.policy_delay,
+        count,
+        lambda actor: _update_policy(actor, learner, batch, draw, method, sac),
         lambda actor: (
             actor,
             {k: v for k, v in metrics.items() if k not in ("critic_loss", "q")},
         ),
         _actor(learner),
     )
-    target = jax.lax.cond(
-        count % sac.target_delay == 0,
+    target = _every(
+        sac.target_delay,
+        count,
         lambda target: optax.incremental_update(critic, target, sac.target_rate),
         lambda target: target,
         learner.target,
@@ -222,3 +269,33 @@ def update(
         target=target,
         optimizers=(policy_state, critic_state, temperature_state),
     ), policy | {"critic_loss": loss, "q": q}
+
+
+def updates(
+    learner: Learner,
+    draws: Draw,
+    batch: Callable[[jax.Array], Batch],
+    first: jax.Array | int,
+    count: jax.Array | int,
+    method: Method,
+    sac: SacSettings,
+) -> tuple[Learner, Metrics]:
+    """Updates one after the other, and the last one's metrics.
+
+    Args:
+      learner: the member's learner.
+      draws: `[count]` or more on every leaf.
+      batch: gives the transitions of the update with a number `[]` int.
+      first: `[]` int, updates made before in this task, see `update`.
+      count: `[]` int, how many to make.
+      method: the method.
+      sac: SAC's settings.
+    """
+
+    def one(number, carry):
+        draw = jax.tree.map(lambda x: x[number], draws)
+        return update(*carry, batch(number), draw, first + number, method, sac)
+
+    draw = jax.tree.map(lambda x: x[0], draws)
+    metrics = no_metrics(learner, batch(jnp.asarray(0)), draw, method, sac)
+    return jax.lax.fori_loop(0, count, one, (learner, metrics))

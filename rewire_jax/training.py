@@ -170,61 +170,56 @@ def store(
     )
 
 
-def draw_batch(
-    key: jax.Array,
-    buffer: replay.Replay,
-    time: jax.Array,
-    length: int,
-    settings: SacSettings,
-) -> replay.Batch:
-    """A batch from a member's buffer of `time` steps; `length` is an episode's."""
-    return replay.sample(buffer, key, time, settings.batch_size, length)
-
-
 def learn(
     key: jax.Array,
     state: State,
     time: jax.Array,
     first: jax.Array,
-    updates: jax.Array | int,
+    due: jax.Array | bool,
     *,
+    updates: int,
     environment: Environment | HostEnvironment,
     method: Method,
     settings: SacSettings,
 ) -> tuple[State, sac.Metrics]:
     """Updates from a member's buffer, and the last one's metrics.
 
+    All that they leave to chance is drawn before the first: many small draws would
+    take more time than one large one.
+
     Args:
       key: a random key.
       state: the member.
       time: `[]` int, steps of all environments in the buffer.
       first: `[]` int, updates made before; shared by all members.
+      due: `[]` bool, whether there are any; shared by all members.
       updates: how many.
       environment: unbatched.
       method: the method.
       settings: SAC's.
     """
     buffer, length = state.collection.buffer, environment.episode_length
+    size = settings.batch_size, environment.action_size
 
-    def draw(key):
-        return draw_batch(key, buffer, time, length, settings)
+    def learned(learner):
+        places_key, draw_key = jax.random.split(key)
+        places = replay.draw(buffer, places_key, time, (updates, size[0]))
+        draws = jax.vmap(
+            lambda key, label: sac.draw(key, learner.memory, label, size, method)
+        )(jax.random.split(draw_key, updates), replay.labels(buffer, places, time))
 
-    def one(number, carry):
-        learner, metrics = carry
-        sample_key, update_key = jax.random.split(jax.random.fold_in(key, number))
-        return sac.update(
-            learner,
-            metrics,
-            draw(sample_key),
-            update_key,
-            first + number,
-            method,
-            settings,
-        )
+        def batch(number):
+            return replay.take(buffer, places[number], time, length)
 
-    zeros = sac.policy_metrics(state.learner, draw(key), method, settings)
-    zeros |= {"critic_loss": jnp.zeros(()), "q": jnp.zeros(())}
-    learner, metrics = jax.lax.fori_loop(0, updates, one, (state.learner, zeros))
+        return sac.updates(learner, draws, batch, first, updates, method, settings)
+
+    # A loop of one turn or none, which stays one under the population.
+    learner, metrics = jax.lax.fori_loop(
+        0,
+        jnp.asarray(due, jnp.int32),
+        lambda _, carry: learned(carry[0]),
+        (state.learner, no_metrics(learned, state.learner)),
+    )
     alive = state.alive & all_finite(
         (learner.params, learner.critic, learner.log_temperature)
     )
@@ -243,13 +238,13 @@ def follow(
     shape: Shape,
 ) -> tuple[State, sac.Metrics]:
     """The updates that are due after so many steps of a task, as in `learn`."""
-    updates = jnp.where(shape.due(steps), shape.updates, 0)
     return learn(
         key,
         state,
         steps,
         shape.before(steps),
-        updates,
+        shape.due(steps),
+        updates=shape.updates,
         environment=environment,
         method=method,
         settings=settings,
@@ -365,5 +360,5 @@ def inspect(
     # A key that the next step does not use.
     batch_key = jax.random.split(jax.random.fold_in(key, time), 3)[2]
     buffer, learner = state.collection.buffer, state.learner
-    batch = draw_batch(batch_key, buffer, time, length, settings)
+    batch = replay.sample(buffer, batch_key, time, settings.batch_size, length)
     return method.inspect(learner.params, learner.memory, batch.observation)

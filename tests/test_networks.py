@@ -67,7 +67,9 @@ def test_log_density_is_that_of_a_squashed_gaussian(mean, std):
     assert mass == pytest.approx(1, abs=1e-4)
 
     arguments = jnp.full((20_000, 1), mean), jnp.full((20_000, 1), np.log(std))
-    action, log_density = jax.jit(networks.sample_action)(KEY, *arguments)
+    action, log_density = jax.jit(networks.sample_action)(
+        jax.random.normal(KEY, arguments[0].shape), *arguments
+    )
     action = np.asarray(action[:, 0], np.float64)
     # Where float32 still tells the action from ±1.
     safe = np.abs(action) < 0.99
@@ -85,7 +87,9 @@ def test_log_densities_add_up_over_actions():
     random = np.random.default_rng(0)
     mean = random.normal(size=(5, 4, 3)).astype(np.float32)
     log_std = random.uniform(-1.5, -0.5, size=(5, 4, 3)).astype(np.float32)
-    action, log_density = jax.jit(networks.sample_action)(KEY, mean, log_std)
+    action, log_density = jax.jit(networks.sample_action)(
+        random.normal(size=mean.shape).astype(np.float32), mean, log_std
+    )
     assert action.shape == (5, 4, 3)
     assert log_density.shape == (5, 4)
     each = np.log(density(action, mean, np.exp(log_std)))
@@ -96,7 +100,7 @@ def test_log_densities_add_up_over_actions():
 def test_a_saturated_action_keeps_finite_density_and_gradients(mean):
     @functools.partial(jax.value_and_grad, argnums=(0, 1))
     def log_density(mean, log_std):
-        return networks.sample_action(KEY, mean, log_std)[1]
+        return networks.sample_action(jnp.full((1,), 0.1), mean, log_std)[1]
 
     arguments = jnp.full((1,), mean), jnp.full((1,), networks.LOG_STD_MIN)
     value, gradients = jax.jit(log_density)(*arguments)

@@ -49,9 +49,11 @@ METHOD = make_method(SPEC)
 
 @jax.jit
 def update(learner, metrics, batch, count, settings):
-    return sac.update(
-        learner, metrics, batch, jax.random.key(1), count, METHOD, settings
-    )
+    return sac.update(learner, metrics, batch, drawn(batch), count, METHOD, settings)
+
+
+def drawn(batch):
+    return sac.draw(jax.random.key(1), (), (), batch.action.shape, METHOD)
 
 
 @pytest.fixture(autouse=True)
@@ -60,7 +62,7 @@ def fixed_noise(request, monkeypatch):
     if "probe" in request.node.name:
         return
 
-    def sample_action(key, mean, log_std):
+    def sample_action(noise, mean, log_std):
         raw = mean + jnp.exp(log_std) * NOISE
         return jnp.tanh(raw), log_density(raw, log_std, jnp)
 
@@ -94,15 +96,8 @@ def learner_and_batch(settings=SETTINGS):
         truncated=(np.arange(size) >= 2) & (np.arange(size) < 4),
         next_observation=numbers[:, 3:6],
     )
-    return (
-        learner,
-        batch,
-        sac.policy_metrics(learner, batch, METHOD, settings)
-        | {
-            "critic_loss": jnp.zeros(()),
-            "q": jnp.zeros(()),
-        },
-    )
+    metrics = sac.no_metrics(learner, batch, drawn(batch), METHOD, settings)
+    return learner, batch, metrics
 
 
 def wide(tree):

@@ -49,17 +49,22 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
     def advance(state, batches, count):
         member, learner = state
         method = make(spec, member.options)
+        drawn, *size = batches.action.shape
 
-        def one(number, carry):
-            batch = jax.tree.map(lambda x: x[number % len(x)], batches)
-            key = jax.random.fold_in(member.keys, number)
-            learner, metrics = carry
-            return sac.update(learner, metrics, batch, key, number, method, member.sac)
+        def batch(number):
+            return jax.tree.map(lambda x: x[number], batches)
 
-        first = jax.tree.map(lambda x: x[0], batches)
-        metrics = sac.policy_metrics(learner, first, method, member.sac)
-        metrics |= {"critic_loss": jnp.zeros(()), "q": jnp.zeros(())}
-        return member, jax.lax.fori_loop(0, count, one, (learner, metrics))[0]
+        def draw(key):
+            return sac.draw(key, learner.memory, (), size, method)
+
+        def several(number, learner):
+            key, first = jax.random.fold_in(member.keys, number), number * drawn
+            draws = jax.vmap(draw)(jax.random.split(key, drawn))
+            made = jnp.minimum(drawn, count - first)
+            numbers = draws, batch, first, made
+            return sac.updates(learner, *numbers, method, member.sac)[0]
+
+        return member, jax.lax.fori_loop(0, -(-count // drawn), several, learner)
 
     state = jax.jit(jax.vmap(begin))(plan.members)
     batches = draw_batches(spec, settings.sac.batch_size)

@@ -185,11 +185,13 @@ class Context(NamedTuple):
 
     Attributes:
       mode: `[]` int, the wiring to use.
+      other: `[]` int, another one, that is distilled; the same where K is 1.
       noise: `[L, n]`, added to its scores.
       key: for dropout.
     """
 
     mode: jax.Array
+    other: jax.Array
     noise: jax.Array
     key: jax.Array
 
@@ -231,12 +233,13 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         ), memory._replace(head=head)
 
     def context(key, memory, purpose, label):
-        mode_key, noise_key, key = jax.random.split(key, 3)
+        mode_key, other_key, noise_key, key = jax.random.split(key, 4)
         mode = jax.random.randint(mode_key, (), 0, modes)
+        offset = jax.random.randint(other_key, (), 1, jnp.maximum(modes, 2))
         noise = jnp.zeros((depth, n))
         if purpose != "act":
             noise = options.noise * jax.random.gumbel(noise_key, (depth, n))
-        return Context(mode, noise, key)
+        return Context(mode, (mode + offset) % modes, noise, key)
 
     def forward(params, memory, scores, key, observation):
         x = observation
@@ -262,17 +265,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         return forward(params, memory, scores, context.key, observation)
 
     def penalty(key, params, memory, context, observation, gaussian):
-        other_key, drop_key = jax.random.split(key)
-        offset = jax.random.randint(other_key, (), 1, jnp.maximum(modes, 2))
-        other = jax.lax.stop_gradient(
-            forward(
-                params,
-                memory,
-                params.scores[(context.mode + offset) % modes],
-                drop_key,
-                observation,
-            )
-        )
+        scores = params.scores[context.other]
+        other = jax.lax.stop_gradient(forward(params, memory, scores, key, observation))
         divergence = _DIVERGENCES[options.distillation](other, gaussian)
         distillation = jnp.where(modes > 1, jnp.mean(divergence), 0.0)
         if options.alignment == "off":
