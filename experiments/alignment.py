@@ -17,7 +17,7 @@ import numpy as np
 import optax
 import tyro
 
-from rewire_jax import networks
+from rewire_jax import keep_compiled, networks
 from rewire_jax.methods import wiring
 from rewire_jax.runfolder import provenance
 
@@ -150,4 +150,5 @@ def run(job: Alignment) -> None:
 
 
 if __name__ == "__main__":
+    keep_compiled()
     run(tyro.cli(Alignment, prog="python -m experiments.alignment"))

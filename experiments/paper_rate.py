@@ -90,4 +90,5 @@ def run(job: PaperRate) -> None:
 
 
 if __name__ == "__main__":
+    rewire_jax.keep_compiled()
     run(tyro.cli(PaperRate, prog="python -m experiments.paper_rate"))

@@ -322,6 +322,7 @@ def write(
 
 def command(kind: type[T], run: Callable[[T], Any], name: str) -> None:
     """Reads the command line and runs; exits with 2 on a user's error."""
+    rewire_jax.keep_compiled()
     try:
         run(tyro.cli(kind, prog=f"python -m experiments.{name}"))
     except UserError as error:

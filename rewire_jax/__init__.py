@@ -4,6 +4,7 @@ Implements "Rewiring Neurons in Non-Stationary Environments" (NeurIPS 2023) and 
 it is compared with. The README has the commands; this is the interface for Python.
 """
 
+from rewire_jax.compilation import keep_compiled
 from rewire_jax.config import SacSettings, Settings
 from rewire_jax.continual import Stopped, train
 from rewire_jax.envs.base import TaskChange
@@ -34,6 +35,7 @@ __all__ = [
     "UserError",
     "evaluate",
     "info",
+    "keep_compiled",
     "list_scenarios",
     "load_policy",
     "make_scenario",

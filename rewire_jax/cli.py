@@ -23,6 +23,7 @@ from rewire_jax import (
     sweeping,
     sweepreport,
 )
+from rewire_jax.compilation import keep_compiled
 from rewire_jax.config import Settings, require
 from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS
@@ -332,6 +333,16 @@ def _list(arguments: Sequence[str]) -> None:
         print(f"{title}:", *entries, sep="\n  ")
 
 
+def _keep(arguments: Sequence[str]) -> list[str]:
+    """Keeps what is compiled as --cache says; returns the other arguments."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--cache", nargs="?", const="")
+    known, others = parser.parse_known_args(arguments)
+    require(known.cache != "", "--cache needs a folder, or off")
+    keep_compiled(known.cache)
+    return others
+
+
 _COMMANDS = {
     "train": _train,
     "sweep": _sweep,
@@ -352,7 +363,9 @@ _USAGE = """usage: rewire-jax COMMAND ...
   info SCENARIO   tasks, budgets, backend, and the model size of each method
   list            scenarios and methods
 
-`rewire-jax COMMAND --help` says more.
+`rewire-jax COMMAND --help` says more. What is compiled is kept for later commands in
+~/.cache/rewire_jax; `--cache DIR` with any command names another folder, and
+`--cache off` keeps nothing.
 """
 
 
@@ -366,7 +379,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         known = ", ".join(_COMMANDS)
         require(name in _COMMANDS, f"unknown command {name!r}: choose one of {known}")
-        _COMMANDS[name](rest)
+        _COMMANDS[name](_keep(rest))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
