@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax import config, rollout, runfolder, standing, training
+from rewire_jax import config, population, rollout, runfolder, standing, training
 from rewire_jax.config import Settings
 from rewire_jax.envs.base import Task
 from rewire_jax.methods.base import Selection
@@ -122,7 +122,8 @@ class Run:
         candidates = program.candidates(self.plan.members, learner, now.stage)
         result = program.rollout(
             jax.tree.map(lambda leaf: np.stack([leaf] * rows), task),
-            _fill(candidates.policies, rows),
+            # Placed as all policies are: else the function is traced once more.
+            population.place(_fill(candidates.policies, rows), self.plan.mesh),
             self.keys(_SELECTION, 2 * now.stage + phase, rows),
             self.plan.settings.selection_episodes,
         )
