@@ -71,6 +71,7 @@ def measure(effort: Effort) -> list[Row]:
         scenario = make_scenario(name, backend)
         environment, task = scenario.environment, scenario.tasks[0].data
         assert isinstance(environment, Environment)
+        print(f"  preparing {backend}", flush=True)
         for count, loop in compiled_loops(environment, task, counts):
             loops[scenario.domain, backend, count] = loop
     if not effort.quick:

@@ -99,6 +99,7 @@ def settings_of(effort: Effort, case: Case) -> Settings:
 
 def make(effort: Effort, case: Case, batches: Batch) -> tuple[Loop, Loop]:
     """The whole loop of a case, and its updates from all the batches."""
+    print(f"  preparing {' '.join(map(str, case))}", flush=True)
     settings = settings_of(effort, case)
     if case.name == OURS:
         update, size = update_loop(settings), len(batches.reward)

@@ -20,6 +20,7 @@ def measure(effort: Effort) -> list[Row]:
         cases = [(2, 8)]
     rows = []
     for modes, width in dict.fromkeys(cases):
+        print(f"  K = {modes}, n = {width}", flush=True)
         rewire = effort.settings("rewire", hidden=width)
         options = replace(rewire.options, modes=modes)
         loops = {
