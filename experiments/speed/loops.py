@@ -130,7 +130,7 @@ def measure(effort: Effort) -> list[Row]:
     batches = draw_batches(prepare(settings).spec, settings.sac.batch_size)
     loops = {case: make(effort, case, batches) for case in cases}
     rounds, seconds = min(effort.rounds, 5), effort.seconds
-    whole = in_turn({case: loops[case][0] for case in cases}, rounds, 2 * seconds)
+    whole = in_turn({case: loops[case][0] for case in cases}, rounds, 4 * seconds)
     alone = in_turn({case: loops[case][1] for case in cases}, rounds, seconds)
     rows = []
     for case in cases:
