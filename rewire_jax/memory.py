@@ -9,6 +9,8 @@ copies.
 import functools
 import math
 import os
+import resource
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -181,6 +183,21 @@ def device_bytes(devices: Sequence[jax.Device]) -> int:
         f"{devices[0].device_kind} does not tell its memory: give --members-per-batch",
     )
     return int(_SHARE * sum(known))
+
+
+def most_held() -> dict[str, int]:
+    """Bytes held at most so far.
+
+    Returns:
+      `process`: by this process on its machine; `device`: by all its devices together,
+      where they have memory of their own and tell.
+    """
+    # In kilobytes, but on macOS.
+    unit = 1 if sys.platform == "darwin" else 1024
+    held = {"process": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    stats = [device.memory_stats() or {} for device in jax.local_devices()]
+    peaks = [each["peak_bytes_in_use"] for each in stats if "peak_bytes_in_use" in each]
+    return held | ({"device": sum(peaks)} if peaks else {})
 
 
 def machine_bytes(root: Path = Path("/")) -> int:

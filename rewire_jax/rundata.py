@@ -53,6 +53,8 @@ class RunData:
         rate: training interactions of all seeds per second, without the chunks that
             compiled and without updates that follow a task's last interaction; None
             where there is no other chunk.
+        memory: most bytes held in training, by `device` or, without memory of its own,
+            `process`; empty where this was not recorded.
     """
 
     folder: Path
@@ -71,6 +73,7 @@ class RunData:
     curve: tuple[tuple[Array, Array], ...]
     hours: float
     rate: float | None
+    memory: dict[str, int]
 
     @property
     def before(self) -> Array:
@@ -132,7 +135,8 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     began = finished > 0
     trained = _curve(folder, len(tasks), place, began, score.training)
     steps = head.episode_length if score.stepwise else 1
-    hours, rate = times(folder / "timing.jsonl", len(tasks), len(seeds), began)
+    timing = folder / "timing.jsonl"
+    hours, rate = times(timing, len(tasks), len(seeds), began)
     return RunData(
         folder=folder,
         settings=head.settings,
@@ -151,6 +155,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
         curve=tuple((x, values * steps) for x, values in trained),
         hours=hours,
         rate=rate,
+        memory=_most_held(timing, began),
     )
 
 
@@ -244,3 +249,18 @@ def times(
         last = (stage, x)
     hours = sum(took for took, _ in rows.values()) / 3600
     return hours, seeds * interactions / seconds if seconds > 0 else None
+
+
+def _most_held(path: Path, began: bool) -> dict[str, int]:
+    """See `RunData.memory`; from a `timing.jsonl`."""
+
+    def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[str, int]]:
+        held = {"process": 0} | row.get("memory", {})
+        where = "device" if "device" in held else "process"
+        key = int(row["stage"]), int(row["interactions"]), int(row.get("polishing", 0))
+        return key, (where, int(held[where]))
+
+    # A run that was stopped goes on in another process, which begins to count anew.
+    rows = table(path, parse, needed=began).values()
+    where, most = max(rows, key=lambda held: held[1], default=("", 0))
+    return {where: most} if most else {}

@@ -1,5 +1,6 @@
 """Run folders as crashes, resumed runs and damage leave them."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,27 @@ def test_updates_after_the_last_interaction_count_in_hours_but_not_in_the_rate(
     data = read_run(run)
     assert data.hours == pytest.approx((3 * 63 + 9) / 3600)
     assert data.rate == pytest.approx(2 * 3 * 750 / 9)
+
+
+def test_most_memory_is_over_all_processes_of_a_run_and_the_device_s_if_known(
+    tmp_path: Path,
+) -> None:
+    run = write_run(tmp_path / "run")
+    assert read_run(run).memory == {}  # an older run
+
+    def report(polishing: int, **memory: int) -> None:
+        row = {"stage": 2, "interactions": 1000, "polishing": polishing}
+        row |= {"seconds": 1, "compile": False, "memory": memory}
+        with (run / "timing.jsonl").open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    report(1, process=700)
+    report(2, process=500)
+    assert read_run(run).memory == {"process": 700}
+    run = write_run(tmp_path / "other")
+    report(1, process=700, device=400)
+    report(2, process=900, device=300)
+    assert read_run(run).memory == {"device": 400}
 
 
 def test_any_value_of_the_progress_reports_can_be_read(tmp_path: Path) -> None:
