@@ -56,32 +56,34 @@ def score_gradient(
     product = sum(jnp.einsum("bim,bjm->bij", g, x) for g, x in pairs)
     rows, columns = _sides(s[..., 0], tau)
 
-    ones = _far(rows, real)
+    ones = _far(rows, real).mT
     inner = _meet((g, _far(rows, x)) for g, x in pairs)
-    lift = jnp.abs(rows.lift[:2])
-    norm = jnp.sum(near, 2) + jnp.sum(lift * ones[:2], 0)
+    lift = jnp.abs(rows.lift[..., :2])
+    norm = jnp.sum(near, 2) + jnp.sum(lift * ones[..., :2], 2)
     # The product with ones is a sum, and quicker on a CPU.
     total = (near * product) @ jnp.ones_like(s[0, :, 0])
-    centre = (total + jnp.sum(lift * inner[:2], 0)) / norm
-    rate = 1 / (norm * tau)
-    slope = rate[..., None] * signed * (product - centre[..., None])
+    centre = ((total + jnp.sum(lift * inner[..., :2], 2)) / norm)[..., None]
+    rate = (1 / (norm * tau))[..., None]
+    slope = rate * signed * (product - centre)
     inner = rows.lift * (inner - centre * ones)
-    as_row = jnp.sum(slope, 2) + rate * jnp.sum(inner, 0)
+    as_row = jnp.sum(slope, 2) + rate[..., 0] * jnp.sum(inner, 2)
 
-    columns = columns._replace(decay=columns.decay * rate)
+    columns = columns._replace(decay=columns.decay * rate.mT)
     inner = _meet((x, _far(columns, g)) for g, x in pairs)
-    inner = columns.lift * (inner - _far(columns, centre[..., None]))
-    as_column = jnp.sum(slope, 1) + jnp.sum(inner, 0)
+    inner = columns.lift * (inner - _far(columns, centre).mT)
+    as_column = jnp.sum(slope, 1) + jnp.sum(inner, 2)
     return (as_column - as_row).reshape(-1)[:n]
 
 
 class _Side(NamedTuple):
     """Signed sums over other blocks: of earlier, of later and of tied later places.
 
+    The order of the axes is the one that is quickest on a CPU, by a third.
+
     Attributes:
-      decay: `[3, blocks, block]`, from a place to the edge of its block.
+      decay: `[blocks, 3, block]`, from a place to the edge of its block.
       gap: `[3, blocks, blocks]`, from there to the edge of another.
-      lift: `[3, blocks, block]`, from there to a place, with the sign.
+      lift: `[blocks, block, 3]`, from there to a place, with the sign.
     """
 
     decay: jax.Array
@@ -96,29 +98,31 @@ def _sides(s, tau):
     is_first, is_last = (s == first).astype(s.dtype), (s == last).astype(s.dtype)
     gap = jnp.tril(jnp.exp(-jnp.abs(first - last.T) / tau), -1)
     tie = jnp.triu((last == first.T).astype(s.dtype), 1)
-    # Tied places count among the later ones with the wrong sign, hence the 2.
-    rows = _Side(
-        jnp.stack([to_last, to_first, is_first]),
-        jnp.stack([gap, gap.T, tie]),
-        jnp.stack([to_first, -to_last, 2 * is_last]),
-    )
-    columns = _Side(
-        jnp.stack([to_first, to_last, is_last]),
-        jnp.stack([gap.T, gap, tie.T]),
-        jnp.stack([to_last, -to_first, 2 * is_first]),
-    )
-    if s.shape[0] > 1:
-        return rows, columns
     # A single block gets nothing from others.
-    return jax.tree.map(lambda x: x[:0], (rows, columns))
+    kinds = slice(3 if s.shape[0] > 1 else 0)
+
+    def side(decay, gap, lift):
+        decay, gap, lift = map(jnp.stack, (decay, gap, lift), (1, 0, 2))
+        return _Side(decay[:, kinds], gap[kinds], lift[..., kinds])
+
+    # Tied places count among the later ones with the wrong sign, hence the 2.
+    return side(
+        (to_last, to_first, is_first),
+        (gap, gap.T, tie),
+        (to_first, -to_last, 2 * is_last),
+    ), side(
+        (to_first, to_last, is_last),
+        (gap.T, gap, tie.T),
+        (to_last, -to_first, 2 * is_first),
+    )
 
 
 def _far(side, x):
-    """`[3, blocks, m]`: what reaches each block from the others of x."""
-    edge = jnp.einsum("tbi,bim->tbm", side.decay, x)
-    return jnp.einsum("tab,tbm->tam", side.gap, edge)
+    """`[blocks, 3, m]`: what reaches each block from the others of x."""
+    edge = jnp.einsum("bti,bim->btm", side.decay, x)
+    return jnp.einsum("tab,btm->atm", side.gap, edge)
 
 
 def _meet(pairs):
-    """`[3, blocks, block]`: products of places with what reaches their block."""
-    return sum(jnp.einsum("bim,tbm->tbi", here, far) for here, far in pairs)
+    """`[blocks, block, 3]`: products of places with what reaches their block."""
+    return sum(jnp.einsum("bim,btm->bit", here, far) for here, far in pairs)
