@@ -74,6 +74,7 @@ def costs(comparison: Comparison) -> Table:
             f"{summary.run.training:,}",
             f"{summary.run.selection:,}",
             number(summary.run.hours),
+            _memory(summary),
             _seeds(summary),
             str(summary.run.provenance.get("device", "–")),
         ]
@@ -86,6 +87,7 @@ def costs(comparison: Comparison) -> Table:
         "training",
         "selection",
         "hours, all seeds together",
+        "most memory held",
         "seeds",
         "device",
     )
@@ -151,6 +153,8 @@ def run_values(summary: Summary) -> dict[str, Any]:
         "selection_interactions": run.selection,
         "hours_all_seeds": run.hours,
         "interactions_per_second": run.rate,
+        "peak_memory_bytes": sum(run.memory.values()) or None,
+        "peak_memory_of": next(iter(run.memory), None),
         "seeds": int(run.kept.sum()),
         "diverged_seeds": len(run.diverged),
         "device": run.provenance.get("device"),
@@ -197,6 +201,11 @@ def interval(value: Interval) -> str:
     scale = max(abs(value.low), abs(value.high))
     ends = f"[{number(value.low, scale)}, {number(value.high, scale)}]"
     return f"{number(value.value, scale)} {ends}"
+
+
+def _memory(summary: Summary) -> str:
+    held = [f"{bytes / 1e9:.2f} GB ({of})" for of, bytes in summary.run.memory.items()]
+    return held[0] if held else "–"
 
 
 def _seeds(summary: Summary) -> str:
