@@ -13,7 +13,8 @@ from experiments import first_task, suite
 from experiments.figure5_evolution import VARIANTS
 from experiments.first_task import FirstTask
 from rewire_jax.evolution import Curve
-from rewire_jax.figures import Array, number
+from rewire_jax.figures import Array
+from rewire_jax.numerals import number
 
 LABELS = {"rewire": "with L_KL", "rewire-undistilled": "without L_KL"}
 QUANTITY = "KL divergence between modes"

@@ -10,7 +10,7 @@ import numpy as np
 from experiments import suite
 from rewire_jax.config import require
 from rewire_jax.evolution import Curve, evolution
-from rewire_jax.figures import number
+from rewire_jax.numerals import number
 from rewire_jax.report import heading
 from rewire_jax.rundata import read_progress, read_run
 

@@ -23,8 +23,6 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
-from orbax.checkpoint._src.multihost import multihost
 
 from rewire_jax.errors import UserError
 
@@ -165,7 +163,7 @@ def _write_item(folder: Path, tree: Any) -> None:
     # our devices. It stores no empty arrays and no empty trees.
     arrays = {str(i): np.asarray(x) for i, x in enumerate(leaves) if x.size}
     if arrays:
-        with _orbax() as orbax:
+        with _orbax() as (ocp, orbax):
             orbax.save(folder, args=ocp.args.PyTreeSave(arrays))
 
 
@@ -173,11 +171,11 @@ def _read_item(folder: Path, like: Any) -> Any:
     leaves, structure = jax.tree.flatten(like)
     names = [str(i) for i, x in enumerate(leaves) if 0 not in x.shape]
     if names:
-        host = ocp.RestoreArgs(restore_type=np.ndarray)
-        args = ocp.args.PyTreeRestore(
-            item=dict.fromkeys(names, 0), restore_args=dict.fromkeys(names, host)
-        )
-        with _orbax() as orbax:
+        with _orbax() as (ocp, orbax):
+            host = ocp.RestoreArgs(restore_type=np.ndarray)
+            args = ocp.args.PyTreeRestore(
+                item=dict.fromkeys(names, 0), restore_args=dict.fromkeys(names, host)
+            )
             arrays = orbax.restore(folder, args=args)
     for i, leaf in enumerate(leaves):
         if 0 in leaf.shape:
@@ -191,8 +189,12 @@ def _read_item(folder: Path, like: Any) -> Any:
 
 
 @contextmanager
-def _orbax() -> Iterator[ocp.Checkpointer]:
-    """A synchronous checkpointer that reports by exceptions alone."""
+def _orbax() -> Iterator[tuple[Any, Any]]:
+    """Orbax, and a synchronous checkpointer that reports by exceptions alone."""
+    # Here, because it takes long to import.
+    import orbax.checkpoint as ocp
+    from orbax.checkpoint._src.multihost import multihost
+
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)  # It logs tracebacks when the disk is full.
@@ -204,7 +206,7 @@ def _orbax() -> Iterator[ocp.Checkpointer]:
         alone = mock.patch.object(multihost, "process_index", return_value=0)
         checkpointer = ocp.Checkpointer(handler, multiprocessing_options=options)
         with alone, checkpointer as orbax:
-            yield orbax
+            yield ocp, orbax
     finally:
         logger.setLevel(level)
 

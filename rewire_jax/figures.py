@@ -16,6 +16,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
+from rewire_jax.numerals import number
 from rewire_jax.scores import Score
 
 Array = NDArray[np.float64]
@@ -52,20 +53,6 @@ class Line(NamedTuple):
     label: str
     curve: Sequence[tuple[Array, Array]]
     scores: Array
-
-
-def number(value: float | None, scale: float | None = None) -> str:
-    """A value as tables and cells show it; more decimals where `scale` is small.
-
-    Args:
-        value: None and NaN are shown as a dash.
-        scale: the magnitude that decides the decimals, by default the value's own.
-    """
-    if value is None or np.isnan(value):
-        return "–"
-    size = abs(value) if scale is None else scale
-    text = f"{value:,.{0 if size >= 100 else 1 if size >= 10 else 2}f}"
-    return text.removeprefix("-") if not text.strip("-0.") else text
 
 
 def mean(values: Array) -> Array:

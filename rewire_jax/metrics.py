@@ -11,8 +11,8 @@ the Statistical Precipice" (NeurIPS 2021).
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 Scores = NDArray[np.float64]
 
@@ -163,7 +163,7 @@ def interquartile_mean(values: ArrayLike) -> Scores:
         `[...]`, NaN where a value is.
     """
     values = np.asarray(values, np.float64)
-    return np.asarray(stats.trim_mean(values, 0.25, axis=-1))
+    return np.asarray(scipy.stats.trim_mean(values, 0.25, axis=-1))
 
 
 def stratified_bootstrap(
@@ -197,7 +197,7 @@ def stratified_bootstrap(
         # scipy resamples along the last axis, whatever stands before it.
         return of(np.concatenate(tasks, axis=axis))
 
-    interval = stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         tuple(scores.T),
         statistic,
         vectorized=True,

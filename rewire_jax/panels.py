@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator, StrMethodFormatter
 
 from rewire_jax.figures import empty, entitle, look
+from rewire_jax.numerals import short
 
 # Settings that the paper has a symbol for.
 _SYMBOLS = {"modes": "K", "alpha": "α", "beta": "β", "tau": "τ"}
@@ -77,11 +78,6 @@ def panels(
         place.set_axis_off()
     entitle(figure, title, reading)
     figure.savefig(path)
-
-
-def short(value: float) -> str:
-    """A setting's value in few characters: 1e-6, not 1e-06."""
-    return f"{value:g}".replace("e-0", "e-").replace("e+0", "e+")
 
 
 def logarithmic(values: np.ndarray) -> bool:

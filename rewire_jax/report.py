@@ -13,11 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from rewire_jax import figures, tables
+from rewire_jax import tables
 from rewire_jax.config import require
 from rewire_jax.errors import UserError
 from rewire_jax.rundata import RunData, read_run
-from rewire_jax.scatter import Point, tradeoff
 from rewire_jax.scenarios import SCENARIOS
 from rewire_jax.scores import SUCCESS, Success
 from rewire_jax.summary import MEASURES, Comparison, Summary, Tasks, summarize
@@ -129,20 +128,13 @@ def write_report(
         matrix=out / "matrix.png",
         tradeoff=out / "tradeoff.png",
     )
-    first, title = report.summaries[0].run, report.title
-    budget = int(first.settings["interactions"])
-    lines = [_line(summary) for summary in report.summaries]
     try:
         out.mkdir(parents=True, exist_ok=True)
         report.markdown.write_text(_markdown(report), encoding="utf-8")
         report.csv.write_text(tables.results_csv(comparison), encoding="utf-8")
         report.tasks.write_text(tables.tasks_csv(comparison), encoding="utf-8")
         report.json.write_text(_json(report), encoding="utf-8")
-        score = comparison.score
-        figures.curves(lines, first.tasks, budget, score, title, report.curves)
-        figures.matrices(lines, first.tasks, score, title, report.matrix)
-        points = [_point(summary) for summary in report.summaries]
-        tradeoff(points, comparison.unit, title, report.tradeoff)
+        _draw(report)
     except OSError as error:
         raise UserError(f"cannot write {error.filename}: {error.strerror}") from None
     return report
@@ -266,17 +258,30 @@ def _notes(comparison: Comparison) -> Iterator[str]:
             yield f"{summary.label}: unfinished, {done}; {end}."
 
 
-def _line(summary: Summary) -> figures.Line:
-    run, kept = summary.run, summary.run.kept
-    scores = np.concatenate([run.before[:, None], run.scores], axis=1)
-    curve = [(x, values[kept]) for x, values in run.curve]
-    return figures.Line(summary.label, curve, scores[kept])
+def _draw(report: Report) -> None:
+    # Here, because Matplotlib takes long to import.
+    from rewire_jax import figures
+    from rewire_jax.scatter import Point, tradeoff
 
+    def line(summary: Summary) -> figures.Line:
+        run, kept = summary.run, summary.run.kept
+        scores = np.concatenate([run.before[:, None], run.scores], axis=1)
+        curve = [(x, values[kept]) for x, values in run.curve]
+        return figures.Line(summary.label, curve, scores[kept])
 
-def _point(summary: Summary) -> Point:
-    value = summary.performance
-    mean = math.nan if value.mean is None else value.mean
-    return Point(summary.label, summary.run.model_size, mean, value.std)
+    def point(summary: Summary) -> Point:
+        value = summary.performance
+        mean = math.nan if value.mean is None else value.mean
+        return Point(summary.label, summary.run.model_size, mean, value.std)
+
+    comparison, title = report.comparison, report.title
+    score, run = comparison.score, report.summaries[0].run
+    budget = int(run.settings["interactions"])
+    lines = [line(summary) for summary in report.summaries]
+    figures.curves(lines, run.tasks, budget, score, title, report.curves)
+    figures.matrices(lines, run.tasks, score, title, report.matrix)
+    points = [point(summary) for summary in report.summaries]
+    tradeoff(points, comparison.unit, title, report.tradeoff)
 
 
 def _markdown(report: Report) -> str:

@@ -8,7 +8,6 @@ import numpy as np
 
 from rewire_jax import sweeptables, tables
 from rewire_jax.errors import UserError
-from rewire_jax.panels import Dot, panels
 from rewire_jax.report import heading
 from rewire_jax.sweepdata import read_sweep
 from rewire_jax.sweepsummary import Configuration, Panel, SweepSummary, summarize_sweep
@@ -190,6 +189,9 @@ def _reading(summary: SweepSummary) -> str:
 
 
 def _draw(report: SweepReport) -> None:
+    # Here, because Matplotlib takes long to import.
+    from rewire_jax.panels import Dot, panels
+
     summary = report.summary
 
     def dot(panel: Panel, each: Configuration) -> Dot:

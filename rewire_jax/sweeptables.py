@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rewire_jax.panels import short
+from rewire_jax.numerals import short
 from rewire_jax.summary import spread
 from rewire_jax.sweepsummary import Configuration, Panel, SweepSummary, performance
 from rewire_jax.tables import Table, columns, csv_text, interval

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from rewire_jax.figures import number
+from rewire_jax.numerals import number
 from rewire_jax.published import Figures
 from rewire_jax.summary import Comparison, Interval, Spread, Summary
 

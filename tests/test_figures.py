@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from rewire_jax import figures
+from rewire_jax import figures, numerals
 from rewire_jax.scores import RETURN
 
 
@@ -29,7 +29,7 @@ def test_nine_methods_have_nine_colours_and_more_have_other_lines() -> None:
     ],
 )
 def test_numbers(value: float | None, scale: float | None, text: str) -> None:
-    assert figures.number(value, scale) == text
+    assert numerals.number(value, scale) == text
 
 
 def test_mean_passes_over_what_is_missing() -> None:

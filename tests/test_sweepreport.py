@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from rewire_jax import panels
+from rewire_jax import numerals, panels
 from rewire_jax.errors import UserError
 from rewire_jax.sweepreport import write_sweep_report
 from tests.fake_sweep import GRID, TASKS, choice, score, write_sweep
@@ -301,7 +301,7 @@ def test_axes_over_decades_are_logarithmic(values, expected):
 
 
 def test_values_are_short():
-    assert [panels.short(x) for x in (0, 1e-6, 1e-5, 0.1, 3, 1e12)] == [
+    assert [numerals.short(x) for x in (0, 1e-6, 1e-5, 0.1, 3, 1e12)] == [
         "0",
         "1e-6",
         "1e-5",
@@ -312,7 +312,7 @@ def test_values_are_short():
     # What is shortened is still the same number.
     for base, power in itertools.product((1, 2.5), range(-12, 13)):
         value = base * 10.0**power
-        assert float(panels.short(value)) == pytest.approx(value, rel=1e-12, abs=0)
+        assert float(numerals.short(value)) == pytest.approx(value, rel=1e-12, abs=0)
 
 
 def test_out_that_is_a_file(tmp_path):
