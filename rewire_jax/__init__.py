@@ -24,6 +24,7 @@ from rewire_jax.scenarios import (
 )
 from rewire_jax.sweeping import sweep
 from rewire_jax.sweepreport import write_sweep_report
+from rewire_jax.version import __version__
 
 __all__ = [
     "SacSettings",
@@ -33,6 +34,7 @@ __all__ = [
     "Stopped",
     "TaskChange",
     "UserError",
+    "__version__",
     "evaluate",
     "info",
     "keep_compiled",

@@ -30,6 +30,7 @@ from rewire_jax.methods import METHODS
 from rewire_jax.presets import preset
 from rewire_jax.scenarios import Scenario, list_scenarios, make_scenario
 from rewire_jax.scores import Success
+from rewire_jax.version import __version__
 
 T = TypeVar("T")
 
@@ -42,13 +43,13 @@ class Train:
       settings: of the run.
       out: folder of the run, new or empty.
       resume: continue the run in that folder from its newest checkpoint.
-      tensorboard: write TensorBoard events too.
+      log: where scalars go, too: tensorboard, wandb, or both.
     """
 
     settings: Settings
     out: Path
     resume: bool = False
-    tensorboard: bool = False
+    log: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,6 +72,7 @@ class Sweep:
         give each the same command.
       processes: how many there are, where no cluster manager says so.
       process: number of this one from 0, where no cluster manager says so.
+      log: where scalars go, too: tensorboard, wandb, or both.
     """
 
     settings: Settings
@@ -82,6 +84,7 @@ class Sweep:
     coordinator: str | None = None
     processes: int | None = None
     process: int | None = None
+    log: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -213,7 +216,7 @@ def _train(arguments: Sequence[str]) -> None:
         train.out,
         scenario=scenario,
         resume=train.resume,
-        tensorboard=train.tensorboard,
+        log=train.log,
     )
     print(f"finished: results, checkpoints and settings are in {folder}")
 
@@ -264,6 +267,7 @@ def _sweep(arguments: Sequence[str]) -> None:
         members_per_batch=asked.members_per_batch,
         scenario=scenario,
         resume=asked.resume,
+        log=asked.log,
     )
     if jax.process_index() == 0:
         _show(sweepreport.write_sweep_report(folder))
@@ -363,9 +367,9 @@ _USAGE = """usage: rewire-jax COMMAND ...
   info SCENARIO   tasks, budgets, backend, and the model size of each method
   list            scenarios and methods
 
-`rewire-jax COMMAND --help` says more. What is compiled is kept for later commands in
-~/.cache/rewire_jax; `--cache DIR` with any command names another folder, and
-`--cache off` keeps nothing.
+`rewire-jax COMMAND --help` says more, `rewire-jax --version` which version this is.
+What is compiled is kept for later commands in ~/.cache/rewire_jax; `--cache DIR` with
+any command names another folder, and `--cache off` keeps nothing.
 """
 
 
@@ -375,6 +379,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE, end="")
         sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        print(f"rewire_jax {__version__}")
+        return
     name, *rest = arguments
     try:
         known = ", ".join(_COMMANDS)

@@ -3,7 +3,7 @@
 import functools
 import signal
 import time as clock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from rewire_jax import (
     config,
+    loggers,
     memory,
     population,
     rollout,
@@ -23,13 +24,13 @@ from rewire_jax import (
 )
 from rewire_jax.config import Settings
 from rewire_jax.envs.base import Task
+from rewire_jax.loggers import Loggers
 from rewire_jax.methods.base import Selection
 from rewire_jax.plan import Plan, base_size, prepare
 from rewire_jax.progress import Progress
 from rewire_jax.sac import Learner
 from rewire_jax.scenarios import Scenario
 from rewire_jax.standing import Standing
-from rewire_jax.tensorboard import Events
 
 # Streams of randomness beside training's, which is 1.
 _EVALUATION, _SELECTION, _CHOICE = 2, 3, 4
@@ -47,7 +48,7 @@ class Run:
         plan: Plan,
         folder: Path,
         progress: Progress,
-        events: Events | None = None,
+        logs: Loggers | None = None,
         choosing: bool = False,
     ):
         """See `train`.
@@ -56,20 +57,28 @@ class Run:
           plan: of the run.
           folder: for its tables and checkpoints; it must exist.
           progress: the display.
-          events: TensorBoard's.
+          logs: its scalars, too; opened by `start`.
           choosing: also plays episodes by which members can be chosen, apart from
             those that are reported.
         """
         self.plan = plan
         self.folder = folder
         self.progress = progress
-        self.events = events or Events(folder, (), False)
+        self.logs = logs or Loggers((), (), progress.message)
         self.choosing = choosing
         self.ahead = 0
         self.stopping = False
 
-    def start(self) -> Standing:
-        """The beginning of the run, after the evaluation of untrained policies."""
+    def start(self, now: Standing | None = None) -> Standing:
+        """The beginning of the run, after the evaluation of untrained policies.
+
+        Args:
+          now: where it stands already, if it does.
+        """
+        if now is not None:
+            self.logs.open(standing.interactions(now, self.plan) + 1)
+            return now
+        self.logs.open(0)
         now = standing.start(self.plan)
         self.evaluate(now, -1)
         return now
@@ -233,7 +242,7 @@ class Run:
         plan, settings, stage = self.plan, self.plan.settings, now.stage
         interactions = now.steps * settings.envs
         returns: list[float | None] = []
-        rows = []
+        rows, known = [], []
         for place, member in enumerate(plan.crowd):
             ended = int(report.episodes[place])
             score = float(report.returns[place]) / ended if ended else None
@@ -245,19 +254,19 @@ class Run:
                 name: _finite(float(total[place]) / updates)
                 for name, total in report.metrics.items()
             }
-            row = {
+            where = {
                 "stage": stage,
                 "member": member.number,
                 "seed": member.seed,
                 "interactions": interactions,
-                "return": _finite(score),
-                "reward": _finite(reward),
             }
+            scores = {"return": _finite(score), "reward": _finite(reward)}
             for name, solved in rollout.named(report.successes).items():
-                row[name] = float(solved[place]) / ended if ended else None
+                scores[name] = float(solved[place]) / ended if ended else None
             for name, values in report.inspected.items():
                 metrics[name] = _finite(float(values[place]))
-            rows.append(row | metrics)
+            known.append(scores | metrics)
+            rows.append(where | scores | metrics)
         runfolder.append(self.folder, "training.jsonl", rows)
         timing = {
             "stage": stage,
@@ -267,8 +276,10 @@ class Run:
             "memory": memory.most_held(),
         }
         runfolder.append(self.folder, "timing.jsonl", [timing])
-        for row in rows:
-            self.events.training(row, plan.interactions)
+        for place, numbers in enumerate(known):
+            self.logs.scalars(
+                place, "training", numbers, standing.interactions(now, plan)
+            )
         rate = steps * settings.envs * len(rows) / seconds
         # As if steps that only update took as long as the others.
         steps_left = (plan.steps + plan.polishing) * (self.ahead + 1)
@@ -338,8 +349,15 @@ class Run:
             for index in range(settings.tasks)
         ]
         runfolder.append(self.folder, "results.jsonl", rows)
-        for row in rows:
-            self.events.evaluation(row)
+        for place in range(len(plan.crowd)):
+            known = {
+                f"{name}/{index:02d}-{task}": _finite(float(x[place, index]))
+                for name, x in scores.items()
+                for index, task in enumerate(plan.names)
+            }
+            self.logs.scalars(
+                place, "evaluation", known, (stage + 1) * plan.interactions
+            )
         return scores["return"][: len(plan.crowd)]
 
 
@@ -403,7 +421,7 @@ def train(
     *,
     scenario: Scenario | None = None,
     resume: bool = False,
-    tensorboard: bool = False,
+    log: Sequence[str] = (),
     progress: Callable[..., Progress] = Progress,
 ) -> Path:
     """Learns a sequence of tasks; see `runfolder` for what it writes.
@@ -413,7 +431,7 @@ def train(
       out: folder of the run, new or empty, or with `resume` an unfinished run's.
       scenario: one of your own; otherwise made from the settings.
       resume: continue from the newest checkpoint that is whole.
-      tensorboard: also write TensorBoard events, one log a seed.
+      log: where scalars go, too, a log for each member: "tensorboard", "wandb".
       progress: makes the display.
 
     Returns:
@@ -424,6 +442,7 @@ def train(
       Stopped: interrupted, and saved.
     """
     folder = Path(out)
+    loggers.check(log)
     plan = prepare(settings, scenario)
     if resume:
         runfolder.compare(folder, plan.settings)
@@ -441,12 +460,15 @@ def train(
         display = stack.enter_context(
             progress(plan.names, plan.interactions, [m.name for m in plan.crowd], label)
         )
-        seeds = [member.seed for member in plan.crowd]
-        events = stack.enter_context(Events(folder, seeds, tensorboard))
-        run = Run(plan, folder, display, events)
+        subjects = [
+            loggers.subject(folder, plan.settings, member, f"seed-{member.seed}")
+            for member in plan.crowd
+        ]
+        logs = stack.enter_context(Loggers(log, subjects, display.message))
+        run = Run(plan, folder, display, logs)
         stack.enter_context(interruptible(run))
         now = standing.restore(folder, plan, display.message) if resume else None
-        now = now or run.start()
+        now = run.start(now)
         while now.stage < plan.settings.tasks:
             now = run.task(now, plan.settings.tasks - now.stage - 1)
     return folder

@@ -98,6 +98,11 @@ def evaluate(
     """
     config.require(episodes >= 1, f"--episodes must be at least 1, not {episodes}")
     folder = Path(run)
+    config.require(
+        runfolder.kind(folder) == "run",
+        f"{folder} holds a sweep: `rewire-jax report {folder}` shows its evaluations, "
+        "load_policy gives the policy of a member",
+    )
     header = runfolder.read_header(folder)
     entry = find_method(header["settings"]["method"])
     plan = prepare(config.from_json(header["settings"], entry.settings))

@@ -21,6 +21,7 @@ import jax
 
 from rewire_jax import config
 from rewire_jax.errors import UserError
+from rewire_jax.version import __version__
 
 FORMAT = 1
 HEADER = "settings.json"
@@ -41,7 +42,7 @@ def provenance() -> dict[str, Any]:
     except (OSError, subprocess.CalledProcessError):
         commit = "unknown"
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
-    versions["rewire_jax"] = importlib.metadata.version("rewire_jax")
+    versions["rewire_jax"] = __version__
     devices = jax.devices()
     return {
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
@@ -65,10 +66,18 @@ def create(folder: Path, header: Mapping[str, Any]) -> None:
                 f"{folder} holds {what}: name another folder with --out, or continue "
                 "the run there with --resume"
             )
-        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error}") from error
+    make(folder)
     write(folder / HEADER, {"format": FORMAT, **header})
+
+
+def make(folder: Path) -> None:
+    """Makes a folder that may be there; `UserError` if it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:

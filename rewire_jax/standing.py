@@ -57,6 +57,12 @@ def start(plan: Plan) -> Standing:
     )
 
 
+def interactions(standing: Standing, plan: Plan) -> int:
+    """Of each member, in all tasks together."""
+    steps = min(standing.steps, plan.steps)
+    return standing.stage * plan.interactions + steps * plan.settings.envs
+
+
 def save(folder: Path, standing: Standing) -> None:
     """Writes a checkpoint, and drops those from within a task that it outdates."""
     items: dict[str, Any] = {

@@ -16,6 +16,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,12 +25,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax import checkpoint, config, memory, population, runfolder, standing
+from rewire_jax import (
+    checkpoint,
+    config,
+    loggers,
+    memory,
+    population,
+    runfolder,
+    standing,
+)
 from rewire_jax.axes import configure, draws, grid, read
 from rewire_jax.config import Settings, require
 from rewire_jax.continual import Run, Stopped, interruptible
 from rewire_jax.errors import UserError
+from rewire_jax.loggers import Loggers
 from rewire_jax.methods import find_method
+from rewire_jax.numerals import short
 from rewire_jax.plan import Plan, prepare
 from rewire_jax.population import Member
 from rewire_jax.progress import Progress
@@ -50,8 +61,10 @@ class Sweep:
       settings: what all members share; at the axes, the first configuration's.
       scenario: of all members.
       crowd: all members, the seeds of a configuration side by side.
+      axes: names of the settings in which they differ.
       halving: of the configurations, one in this many goes on to the next task.
       most: members trained side by side at most.
+      log: where scalars go, too, as `train` has it.
       progress: makes the display.
     """
 
@@ -59,8 +72,10 @@ class Sweep:
     settings: Settings
     scenario: Scenario
     crowd: tuple[Member, ...]
+    axes: tuple[str, ...]
     halving: int
     most: int
+    log: tuple[str, ...]
     progress: Callable[..., Progress]
 
     def run(self) -> None:
@@ -90,7 +105,7 @@ class Sweep:
             numbers = self.survivors(stage)
             size, count = self.share(len(numbers))
             batches = [numbers[i * size : (i + 1) * size] for i in range(count)]
-            path.parent.mkdir(exist_ok=True)
+            runfolder.make(path.parent)
             runfolder.write(path, {"size": size, "batches": batches})
         _wait(path.exists)
         read = json.loads(path.read_text())
@@ -142,23 +157,37 @@ class Sweep:
         if standing.finished(folder, stage):
             return
         plan = self.plan(batches[number], places)
-        folder.mkdir(exist_ok=True)
+        runfolder.make(folder)
         label = f"{self.settings.method} sweep on {self.settings.scenario}"
         if len(batches) > 1:
             label += f", batch {number + 1} of {len(batches)}"
         names = [member.name for member in plan.crowd]
-        with self.progress(plan.names, plan.interactions, names, label) as display:
-            run = Run(plan, folder, display, choosing=True)
+        with ExitStack() as stack:
+            display = stack.enter_context(
+                self.progress(plan.names, plan.interactions, names, label)
+            )
+            subjects = [self.subject(member) for member in plan.crowd]
+            logs = stack.enter_context(Loggers(self.log, subjects, display.message))
+            run = Run(plan, folder, display, logs, choosing=True)
 
             def start() -> Standing:
                 now = standing.restore(folder, plan, display.message)
-                return now or (self.gather(stage, plan) if stage else run.start())
+                if now is None and stage:
+                    now = self.gather(stage, plan)
+                return run.start(now)
 
             with interruptible(run):
                 # Where it stands is not kept here: what was learned before would be.
                 run.task(start(), self.ahead(stage, number, len(batches)))
             if run.stopping:  # since the last chunk
                 raise Stopped
+
+    def subject(self, member: Member) -> loggers.Subject:
+        """Whose log a member's is, from one task to the next."""
+        values = {name: read(member, name) for name in self.axes}
+        facts = [f"{name}={short(value)}" for name, value in values.items()]
+        facts = [f"member-{member.number:03d}", *facts, f"seed={member.seed}"]
+        return loggers.subject(self.folder, self.settings, member, ",".join(facts))
 
     def ahead(self, stage: int, number: int, batches: int) -> int:
         """Batches that this process is still to train after one."""
@@ -203,6 +232,7 @@ def sweep(
     members_per_batch: int = 0,
     scenario: Scenario | None = None,
     resume: bool = False,
+    log: Sequence[str] = (),
     progress: Callable[..., Progress] = Progress,
 ) -> Path:
     """Trains every configuration with every seed as one population.
@@ -222,6 +252,7 @@ def sweep(
       members_per_batch: trained side by side at most; 0 for as many as fit.
       scenario: one of your own; otherwise made from the settings.
       resume: go on with what is not finished.
+      log: where scalars go, too, as `train` has it.
       progress: makes the display.
 
     Returns:
@@ -236,6 +267,7 @@ def sweep(
     require(members_per_batch >= 0, "--members-per-batch must be at least 0")
     require(random >= 0, f"--random must be at least 0, not {random}")
     config.validate(settings)
+    loggers.check(log)
     given = {name: [float(x) for x in values] for name, values in (axes or {}).items()}
     if not configurations:
         require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
@@ -283,8 +315,10 @@ def sweep(
         settings=plan.settings,
         scenario=scenario,
         crowd=crowd,
+        axes=tuple(configurations[0]),
         halving=halving,
         most=members_per_batch or memory.fitting(need, jax.local_devices()),
+        log=tuple(log),
         progress=progress,
     )
     size, _ = made.share(len(crowd))

@@ -41,7 +41,7 @@ def rows(folder: Path, table: str = "results.jsonl") -> list[dict]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    return continual.train(tiny(), folder, tensorboard=True)
+    return continual.train(tiny(), folder, log=["tensorboard"])
 
 
 def checkpoints(folder: Path) -> list[str]:

@@ -16,7 +16,16 @@ import numpy as np
 import pytest
 
 import rewire_jax
-from rewire_jax import axes, cli, continual, networks, plan, standing, sweeping
+from rewire_jax import (
+    axes,
+    cli,
+    continual,
+    networks,
+    plan,
+    runfolder,
+    standing,
+    sweeping,
+)
 from rewire_jax.config import Settings
 from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS, Entry
@@ -367,8 +376,14 @@ def test_another_sweep_or_a_run_is_not_resumed(
     ):
         with pytest.raises(UserError, match=said):
             rewire_jax.load_policy(swept, **wrong)
-    with pytest.raises(UserError, match="holds a sweep, not a run"):
+    with pytest.raises(UserError, match=r"holds a sweep: .* load_policy"):
         rewire_jax.evaluate(swept)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "sweep").touch()
+    with pytest.raises(UserError, match=r"cannot write to .*task-000: Not a directory"):
+        runfolder.make(tmp_path / "sweep" / "task-000")
 
 
 def test_report_takes_a_sweep(swept: Path, tmp_path: Path) -> None:
