@@ -27,7 +27,7 @@ def permute(x: jax.Array, scores: jax.Array, tau: jax.typing.ArrayLike) -> jax.A
     The value is `x[..., argsort(scores)]`; ties keep their place. The gradient in
     `x` is that of this gather. The gradient in `scores` is that of the straight-
     through form `x @ (P + Q - stop_gradient(Q)).T` with P the hard permutation and
-    Q[i, j] = softmax_j(-|sort(scores)_i - scores_j| / tau), without building P or Q.
+    `Q[i, j] = softmax_j(-|sort(scores)_i - scores_j| / tau)`, without building either.
 
     Args:
       x: `[..., n]`, any floating dtype.
