@@ -7,6 +7,7 @@ timing.jsonl      a row for each progress report: wall-clock seconds
 checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
 """
 
+import contextlib
 import importlib.metadata
 import json
 import os
@@ -31,16 +32,17 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "mujoco", "orbax-checkpoi
 
 def provenance() -> dict[str, Any]:
     """What a result must be traced back by: command, commit, versions, device."""
-    here = Path(__file__).parent
-    try:
-        commit = subprocess.run(
-            ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"],
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
+    root = Path(__file__).parent.parent
+    commit = "unknown"
+    # Installed, it may stand in the repository of something else.
+    if (root / ".git").exists():
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            commit = subprocess.run(
+                ["git", "-C", root, "describe", "--always", "--dirty", "--abbrev=12"],
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout.strip()
     versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
     versions["rewire_jax"] = __version__
     devices = jax.devices()

@@ -68,6 +68,10 @@ def test_the_version_is_everywhere_the_same() -> None:
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     """A fresh environment's Python, an sdist, and a wheel made from that."""
     folder = tmp_path_factory.mktemp("packaging")
+    # As of a project of someone's, which must not pass for ours.
+    run("git", "init", "--quiet", folder)
+    who = ["-c", "user.name=A", "-c", "user.email=a@example.org"]
+    run("git", *who, "commit", "--allow-empty", "--quiet", "-m", "Theirs", cwd=folder)
     run(sys.executable, "-m", "venv", folder / "venv")
     python = folder / "venv" / "bin" / "python"
     requires = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]
@@ -135,6 +139,7 @@ def test_an_installed_wheel_works_where_the_repository_is_not(
     assert len(rows) == 2 * 4
     header = json.loads((tmp_path / "run" / "settings.json").read_text())
     assert header["provenance"]["versions"]["rewire_jax"] == rewire_jax.__version__
+    assert header["provenance"]["commit"] == "unknown"
     run(command, "report", "run", **there)
 
 
