@@ -297,6 +297,8 @@ def test_the_real_thing_without_a_network(
     for seed in range(2):
         known = json.loads((tmp_path / "run/wandb" / f"seed-{seed}.json").read_text())
         assert known["training"] == known["evaluation"] == 2 * 320
-        written = list((tmp_path / "run/wandb").glob(f"*/run-{known['id']}.wandb"))
+        written = list(
+            (tmp_path / "run/wandb").glob(f"offline-*/run-{known['id']}.wandb")
+        )
         assert len(written) == 2
         assert all(path.stat().st_size > 0 for path in written)
