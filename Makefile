@@ -26,7 +26,8 @@ option = $(if $(strip $(2)),--$(1) $(2))
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
-	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme clean
+	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
+	docs clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
@@ -86,7 +87,7 @@ export LOCK
 lint: setup ## Check style, format and types
 	$(RUN) -m ruff check
 	$(RUN) -m ruff format --check
-	$(RUN) -m mypy rewire_jax experiments
+	$(RUN) -m mypy rewire_jax experiments docs
 
 format: setup ## Mend what ruff can mend
 	$(RUN) -m ruff check --fix
@@ -134,6 +135,12 @@ bench-mjx: setup-mjx ## Measure steps a second of Meta-World on MJX-Warp
 readme: setup ## Make the tables of README.md anew from experiments/results
 	$(RUN) -m experiments.readme
 
+docs: setup ## Build the documentation into site/, warnings being errors
+	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --fresh-env \
+		--doctree-dir build/doctrees docs site
+	@echo 'open site/index.html'
+
 clean: ## Remove caches and build outputs; .venv and runs/ stay
-	rm -rf .jax_cache .mypy_cache .pytest_cache .ruff_cache build dist *.egg-info
-	find rewire_jax experiments tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .jax_cache .mypy_cache .pytest_cache .ruff_cache build dist site \
+		docs/drawings *.egg-info
+	find rewire_jax experiments docs tests -name __pycache__ -type d -prune -exec rm -rf {} +

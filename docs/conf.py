@@ -1,0 +1,46 @@
+"""How Sphinx builds the documentation; `make docs` does.
+
+Nothing is fetched, neither to build it nor to read it.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))  # for docs and experiments
+
+from docs import drawings, made  # noqa: E402
+
+project = "rewire_jax"
+author = "the authors of rewire_jax"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["drawings"]
+smartquotes = False  # They would make a dash of a flag's hyphens.
+default_role = "code"  # Docstrings quote code by single backticks.
+myst_heading_anchors = 3
+myst_enable_extensions = ["colon_fence"]
+
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+add_module_names = False
+napoleon_use_ivar = True
+python_maximum_signature_line_length = 88
+python_use_unqualified_type_names = True
+
+html_theme = "furo"
+html_title = "rewire_jax"
+html_copy_source = False
+html_show_copyright = False
+
+
+def _skip(app: Any, what: str, name: str, each: Any, skip: bool, options: Any) -> bool:
+    """Leaves out the fields of named tuples, which their class has described."""
+    return skip or (each.__doc__ or "").startswith("Alias for field number")
+
+
+def setup(app: Any) -> None:
+    """Drawings and tables are made whenever the documentation is built."""
+    app.connect("builder-inited", lambda app: drawings.write(ROOT / "docs/drawings"))
+    app.connect("source-read", made.fill)
+    app.connect("autodoc-skip-member", _skip)

@@ -1,0 +1,278 @@
+"""What the pages do not say by hand: `<!-- made: NAME ARGUMENT -->` stands for it."""
+
+import dataclasses
+import importlib
+import inspect
+import re
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import docstring_parser
+import tyro
+
+import rewire_jax
+from experiments import suite
+from rewire_jax import cli, config
+from rewire_jax.methods import METHODS
+
+ROOT = Path(__file__).resolve().parent.parent
+_EXAMPLE = "halfcheetah/forgetting"
+
+
+def fill(app: Any, page: str, source: list[str]) -> None:
+    """Sphinx's event `source-read`: puts in a page what is made."""
+    del app, page
+    source[0] = re.sub(
+        r"<!-- made: (\w+) ?(\S*) -->", lambda m: MADE[m[1]](m[2]), source[0]
+    )
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+class Item(typing.NamedTuple):
+    """An argument or a setting, as its class describes it."""
+
+    name: str
+    kind: Any
+    default: Any
+    meaning: str
+
+
+def items(cls: type) -> Iterator[Item]:
+    """The fields of a dataclass that tyro makes arguments of."""
+    meanings: dict[str, str] = {}
+    for each in reversed(cls.__mro__):
+        for said in docstring_parser.parse(each.__doc__ or "").params:
+            meanings[said.arg_name] = " ".join((said.description or "").split())
+    hints = typing.get_type_hints(cls, include_extras=True)
+    for field in dataclasses.fields(cls):
+        kind = hints[field.name]
+        if tyro.conf.Suppress not in getattr(kind, "__metadata__", ()):
+            meaning = meanings[field.name]
+            yield Item(field.name, kind, field.default, meaning)
+
+
+def values(kind: Any) -> str:
+    """What an argument can be, in a word or its choices."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        return values(inner[0])
+    if origin is Literal:
+        return ", ".join(f"`{value}`" for value in inner)
+    if origin in (Union, type(int | None)):
+        return values(inner[0])
+    if origin is tuple:
+        return f"{values(inner[0])}, several"
+    return {bool: "yes or no", str: "text", Path: "path"}.get(kind, kind.__name__)
+
+
+def shown(value: Any) -> str:
+    """A value as one types it; nothing where there is none."""
+    if value is None or value is dataclasses.MISSING or value == ():
+        return ""
+    if isinstance(value, tuple):
+        return " ".join(shown(each) for each in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+
+
+def argument(item: Item) -> str:
+    """The flag, or the name where an argument goes by its place."""
+    marks = getattr(item.kind, "__metadata__", ())
+    placed = any("POSITIONAL" in str(mark).upper() for mark in marks)
+    return f"`{item.name.upper() if placed else config.flag(item.name)}`"
+
+
+def arguments(cls: type) -> str:
+    """A table of a command's arguments but the settings of a run."""
+    return table(
+        ["argument", "values", "default", "meaning"],
+        [
+            [argument(item), values(item.kind), shown(item.default), item.meaning]
+            for item in items(cls)
+            if item.name != "settings"
+        ],
+    )
+
+
+def prose(thing: Any) -> str:
+    """A docstring before its first section, flags as code."""
+    said = re.split(r"\n\n(?:Attributes|Raises):", inspect.getdoc(thing) or "")[0]
+    return re.sub(r"(?<![`\w-])--[a-z][a-z-]*", r"`\g<0>`", said)
+
+
+def usage(_: str) -> str:
+    """What `rewire-jax` says of itself."""
+    return f"```text\n{cli._USAGE.strip()}\n```"
+
+
+def commands(_: str) -> str:
+    """Each command of `rewire-jax`: the dataclass of its name in `cli`."""
+    parts = []
+    for name in cli._COMMANDS:
+        cls = getattr(cli, name.title())
+        needs = " SCENARIO" if "settings" in cls.__annotations__ else ""
+        parts += [f"## `rewire-jax {name}{needs}`", prose(cls), arguments(cls)]
+        if needs:
+            parts += ["And [the settings of a run](settings.md), as flags."]
+    return "\n\n".join(parts)
+
+
+def experiments(_: str) -> str:
+    """Each script in experiments that takes arguments."""
+    parts = []
+    for path in sorted((ROOT / "experiments").glob("*.py")):
+        if "suite.command(" not in path.read_text() or path.stem == "suite":
+            continue
+        module = importlib.import_module(f"experiments.{path.stem}")
+        (job, *_rest) = typing.get_type_hints(module.run).values()
+        parts += [f"## `python -m experiments.{path.stem}`", prose(module)]
+        parts += [arguments(job)]
+    return "\n\n".join(parts)
+
+
+def targets(_: str) -> str:
+    """The Makefile's targets, as `make help` has them."""
+    found = re.findall(r"^([a-z-]+):.*## (.*)", (ROOT / "Makefile").read_text(), re.M)
+    return table(
+        ["command", "what it does"], [[f"`make {name}`", said] for name, said in found]
+    )
+
+
+def settings(which: str) -> str:
+    """A table of settings: of a run, of SAC, or of a method by its name."""
+    presets = {
+        profile: rewire_jax.preset(
+            rewire_jax.make_scenario(_EXAMPLE),
+            which if which in METHODS else "rewire",
+            profile,
+        )
+        for profile in ("paper", "quick")
+    }
+    parts = {"run": config.Settings, "sac": config.SacSettings}
+    cls = parts.get(which) or METHODS[which].settings
+    if which == "sac":
+        chosen: list[Any] = [preset.sac for preset in presets.values()]
+    else:
+        chosen = [p if which == "run" else p.options for p in presets.values()]
+    traced = config.traced_fields(cls)
+    return table(
+        ["setting", "values", "paper", "quick", "axis", "meaning"],
+        [
+            [
+                argument(item),
+                values(item.kind),
+                *(shown(getattr(each, item.name)) for each in chosen),
+                "yes" if item.name in traced else "",
+                item.meaning,
+            ]
+            for item in items(cls)
+            if item.name not in ("scenario", "sac", "options")
+        ],
+    )
+
+
+def methods(_: str) -> str:
+    """The settings of every method that has any."""
+    named: dict[type, list[str]] = {}
+    for name, entry in METHODS.items():
+        named.setdefault(entry.settings, []).append(name)
+    parts = []
+    for cls, names in named.items():
+        parts += ["## " + ", ".join(f"`{name}`" for name in names)]
+        some = dataclasses.fields(cls)
+        parts += [settings(names[0]) if some else prose(cls)]
+    return "\n\n".join(parts)
+
+
+def scenarios(method: str) -> str:
+    """What the paper profile has otherwise on some scenarios than on others."""
+    rows = {}
+    for name in rewire_jax.list_scenarios():
+        preset = rewire_jax.preset(rewire_jax.make_scenario(name), method)
+        rows[name] = vars(preset) | vars(preset.sac) | vars(preset.options)
+    first, *others = rows.values()
+    names = [
+        item.name
+        for cls in (config.Settings, config.SacSettings, METHODS[method].settings)
+        for item in items(cls)
+        if any(first[item.name] != other[item.name] for other in others)
+    ]
+    names = [name for name in names if name not in ("scenario", "sac", "options")]
+    return table(
+        ["scenario", *(f"`{config.flag(name)}`" for name in names)],
+        [
+            [f"`{at}`", *(shown(row[name]) for name in names)]
+            for at, row in rows.items()
+        ],
+    )
+
+
+def default(name: str) -> str:
+    """A setting's default, and the profiles' where theirs differ."""
+    scenario = rewire_jax.make_scenario(_EXAMPLE)
+    for method in METHODS:
+        presets = [
+            rewire_jax.preset(scenario, method, each) for each in ("paper", "quick")
+        ]
+        for part in ("", "sac", "options"):
+            owners = [getattr(each, part) if part else each for each in presets]
+            if name in vars(owners[0]):
+                paper, quick = (shown(getattr(owner, name)) for owner in owners)
+                own = shown(getattr(type(owners[0]), name, None))
+                found = dict.fromkeys([own or paper, paper, quick])
+                if len(found) == 1:
+                    return paper
+                return f"{own or 'none'}; paper {paper}, quick {quick}"
+    raise KeyError(name)
+
+
+def results(prefix: str) -> str:
+    """The committed results whose names begin so; says so if there are none."""
+    parts = []
+    for path in sorted((ROOT / suite.RESULTS).glob(f"{prefix}*")):
+        pages = path.glob("*.md") if path.is_dir() else [path]
+        parts += [
+            f"````{{include}} ../{page.relative_to(ROOT).as_posix()}\n"
+            ":relative-images:\n:heading-offset: 2\n````"
+            for page in sorted(pages)
+            if page.suffix == ".md"
+        ]
+    return "\n\n".join(parts) or "No result is committed yet."
+
+
+def public(_: str) -> str:
+    """Everything in `rewire_jax.__all__`, described from its docstring."""
+    blocks = []
+    for name in sorted(rewire_jax.__all__):
+        value = getattr(rewire_jax, name)
+        if inspect.isclass(value):
+            blocks.append(f".. autoclass:: rewire_jax.{name}\n   :members:")
+        else:
+            kind = "function" if callable(value) else "data"
+            blocks.append(f".. auto{kind}:: rewire_jax.{name}")
+    return "```{eval-rst}\n" + "\n\n".join(blocks) + "\n```"
+
+
+MADE: dict[str, Callable[[str], str]] = {
+    each.__name__: each
+    for each in (
+        commands,
+        default,
+        experiments,
+        methods,
+        public,
+        results,
+        scenarios,
+        settings,
+        targets,
+        usage,
+    )
+}
