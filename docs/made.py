@@ -192,27 +192,34 @@ def methods(_: str) -> str:
     return "\n\n".join(parts)
 
 
-def scenarios(method: str) -> str:
+def by_scenario(_: str) -> str:
     """What the paper profile has otherwise on some scenarios than on others."""
-    rows = {}
-    for name in rewire_jax.list_scenarios():
-        preset = rewire_jax.preset(rewire_jax.make_scenario(name), method)
-        rows[name] = vars(preset) | vars(preset.sac) | vars(preset.options)
-    first, *others = rows.values()
-    names = [
-        item.name
-        for cls in (config.Settings, config.SacSettings, METHODS[method].settings)
-        for item in items(cls)
-        if any(first[item.name] != other[item.name] for other in others)
-    ]
-    names = [name for name in names if name not in ("scenario", "sac", "options")]
-    return table(
-        ["scenario", *(f"`{config.flag(name)}`" for name in names)],
-        [
-            [f"`{at}`", *(shown(row[name]) for name in names)]
-            for at, row in rows.items()
-        ],
-    )
+    known = [rewire_jax.make_scenario(name) for name in rewire_jax.list_scenarios()]
+    parts = []
+    for title, method, part in (
+        ("A run", "rewire", None),
+        ("SAC", "rewire", "sac"),
+        *((f"`{name}`", name, "options") for name in METHODS),
+    ):
+        rows: dict[str, dict[str, Any]] = {}
+        for scenario in known:
+            preset = rewire_jax.preset(scenario, method)
+            rows[scenario.name] = vars(getattr(preset, part) if part else preset)
+        first, *others = rows.values()
+        names = [
+            name
+            for name in first
+            if name not in ("scenario", "paper_interactions", "sac", "options")
+            and any(first[name] != other[name] for other in others)
+        ]
+        same: dict[tuple[str, ...], list[str]] = {}
+        for at, row in rows.items():
+            same.setdefault(tuple(shown(row[n]) for n in names), []).append(f"`{at}`")
+        heads = ["scenarios", *(f"`{config.flag(name)}`" for name in names)]
+        if names:
+            lines = [[", ".join(at), *cells] for cells, at in same.items()]
+            parts += [f"### {title}", table(heads, lines)]
+    return "\n\n".join(parts)
 
 
 def default(name: str) -> str:
@@ -264,13 +271,13 @@ def public(_: str) -> str:
 MADE: dict[str, Callable[[str], str]] = {
     each.__name__: each
     for each in (
+        by_scenario,
         commands,
         default,
         experiments,
         methods,
         public,
         results,
-        scenarios,
         settings,
         targets,
         usage,
