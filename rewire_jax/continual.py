@@ -25,7 +25,7 @@ from rewire_jax import (
 from rewire_jax.config import Settings
 from rewire_jax.envs.base import Task
 from rewire_jax.loggers import Loggers
-from rewire_jax.methods.base import Selection
+from rewire_jax.methods.base import Selection, map_own
 from rewire_jax.plan import Plan, base_size, prepare
 from rewire_jax.progress import Progress
 from rewire_jax.sac import Learner
@@ -107,8 +107,10 @@ class Run:
                 raise Stopped(
                     f"stopped and saved: continue with --resume --out {self.folder}"
                 )
+        assert now.state is not None
+        # The replay buffer goes before policies are rolled out.
+        now = now._replace(learner=now.state.learner, state=None)
         now = self.conclude(now, task)
-        # By now the replay buffer is gone.
         returns = [_finite(float(r)) for r in self.evaluate(now, stage)[:, stage]]
         standing.save(self.folder, now)
         self.progress.finish_task(stage, returns, clock.perf_counter() - began)
@@ -295,8 +297,8 @@ class Run:
     def conclude(self, now: Standing, task: Task) -> Standing:
         """Lets the method choose among its candidates, and end the task."""
         program, members, stage = self.plan.program, self.plan.members, now.stage
-        assert now.state is not None
-        learner = now.state.learner
+        learner = now.learner
+        assert learner is not None
         after, spent = self.select(now, learner, task, 1)
         chosen_by = None if after is None else Selection(now.before, after)
         return Standing(
@@ -376,7 +378,7 @@ def _make_keys(keys: jax.Array, stream: int, number: int, rows: int) -> jax.Arra
 @functools.partial(jax.jit, static_argnames="rows")
 def _fill(policies: Any, rows: int) -> Any:
     """Policies `[members, candidates]` in so many rows, over and over."""
-    return jax.tree.map(lambda leaf: leaf[:, np.arange(rows) % leaf.shape[1]], policies)
+    return map_own(lambda leaf: leaf[:, np.arange(rows) % leaf.shape[1]], policies)
 
 
 @jax.jit

@@ -23,6 +23,7 @@ from rewire_jax import noise, training
 from rewire_jax.config import require
 from rewire_jax.envs.base import Environment
 from rewire_jax.methods import find_method
+from rewire_jax.methods.base import map_own
 from rewire_jax.plan import Plan
 
 # Of a device's memory; the rest is for compiled code and what others hold.
@@ -39,7 +40,8 @@ class Need(NamedTuple):
       buffer: the replay buffer, held in training.
       environments: held in training.
       work: taken for a while beside these, by an update, a step or a choice.
-      evaluation: taken beside the learner, when there is no buffer.
+      evaluation: taken beside the learner, when there is no buffer; also to choose
+        between policies at a task's end.
     """
 
     learner: int
@@ -96,9 +98,10 @@ def need(plan: Plan) -> Need:
             return simulate(task, now, mean)
 
         start = jax.eval_shape(environment.reset, task, member.keys)
+        policy = map_own(one, policies)
         episode = max(
             peak(environment.reset, task, member.keys),
-            size(start) + peak(step, member, task, one(policies), start),
+            size(start) + peak(step, member, task, policy, start),
         )
     learner = size(mine.learner)
     work = [
@@ -108,10 +111,13 @@ def need(plan: Plan) -> Need:
     ]
     if program.consolidate:
         work.append(peak(program.consolidate, plan.members, state, 0, 1) // plan.places)
+    selection = 0
     if program.candidates and plan.rows:
         chosen = one(jax.eval_shape(program.candidates, plan.members, fresh, 0))
         share = size(chosen.policies) // chosen.valid.size
-        work.append(plan.rows * (share + episode * settings.selection_episodes))
+        selection = plan.rows * (share + episode * settings.selection_episodes)
+    if program.baseline:
+        work.append(selection)
     environments = size(mine.collection) - size(mine.collection.buffer)
     environments += size(mine.acting)
     if settings.sac.noise_color:
@@ -128,7 +134,10 @@ def need(plan: Plan) -> Need:
         buffer=size(mine.collection.buffer),
         environments=environments,
         work=max(work),
-        evaluation=size(policies) + episode * settings.tasks * settings.eval_episodes,
+        evaluation=max(
+            size(policies) + episode * settings.tasks * settings.eval_episodes,
+            selection,
+        ),
     )
 
 

@@ -5,6 +5,7 @@
 
 import functools
 import itertools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from rewire_jax.envs.base import HostEnvironment, Task
 from rewire_jax.lanes import Lanes, draw_seed, open_lanes, shown
+from rewire_jax.methods.base import map_own
 from rewire_jax.rollout import Rollout, Success
 
 Array = NDArray[Any]
@@ -56,7 +58,8 @@ def play(
             who, which = np.array(turn).T
             at = who, np.full(len(turn), row), which
             seeds = [draw_seed(*roots[m, row], e) for m, e in turn]
-            policy = jax.tree.map(lambda leaf, w=who, r=row: leaf[w, r], policies)
+            of_task = map_own(operator.itemgetter((slice(None), row)), policies)
+            policy = jax.tree.map(lambda leaf, w=who: leaf[w], of_task)
             result = _play(environment, lanes, act, task, policy, seeds)
             for kept, values in zip((returns, lengths, *solved), result, strict=True):
                 kept[at] = values

@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from rewire_jax import hosted, population, replay, rollout, sac, training
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools
+from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools, axes
 from rewire_jax.training import Collection, Report, Shape, State
 
 
@@ -30,7 +30,8 @@ class Program(NamedTuple):
         buffer as in `steps` steps, `done` of which were made before.
       candidates: `(members, learner, index) -> Candidates`, or None.
       finish: `(members, learner, index, Selection or None) -> Learner`.
-      policies: `(members, learner) -> policies [members, tasks]`.
+      policies: `(members, learner) -> policies [members, tasks]`; without the second
+        axis what is `Shared`.
       rollout: `(tasks, policies, keys, count) -> Rollout`, see `rollout.episodes`.
       expect: what `begin` gives for the same arguments, as shapes.
       traces: `() -> int`, how often a function that trains was traced so far.
@@ -178,7 +179,9 @@ def build(
     def policies(member, learner):
         method = make(spec, member.options)
         policy = functools.partial(method.policy, learner.params, learner.memory)
-        return jax.vmap(policy)(jnp.arange(spec.tasks))
+        tasks = jnp.arange(spec.tasks)
+        out_axes = axes(jax.eval_shape(policy, tasks[0]))
+        return jax.vmap(policy, out_axes=out_axes)(tasks)
 
     def size(member, learner):
         return make(spec, member.options).size(learner.params, learner.memory)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.envs.base import Environment, HostEnvironment, State, Task
+from rewire_jax.methods.base import axes
 
 
 class Success(NamedTuple):
@@ -149,7 +150,7 @@ def episodes(
       environment: unbatched.
       act: `(policy, observation) -> mean, log_std`.
       tasks: pytree with a leading axis `[rows]`.
-      policies: pytree with leading axes `[members, rows]`.
+      policies: pytree with leading axes `[members, rows]`; `[members]` where `Shared`.
       keys: `[members, rows]`.
       count: episodes for each member and row.
 
@@ -160,7 +161,7 @@ def episodes(
     def over(function: Callable[..., Any]) -> Callable[..., Any]:
         # Members, rows, episodes; a task is shared by members, a policy by episodes.
         function = jax.vmap(function, (None, None, 0))
-        return jax.vmap(jax.vmap(function), (None, 0, 0))
+        return jax.vmap(jax.vmap(function, (0, axes(policies), 0)), (None, 0, 0))
 
     def reset(task, policy, key):
         return environment.reset(task, key)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 import rewire_jax
+from rewire_jax.continual import Run
 from rewire_jax.memory import machine_bytes, size
 from rewire_jax.plan import prepare
 from rewire_jax.progress import Progress
@@ -164,9 +165,18 @@ def test_updates_draw_no_random_bits(chunk, updates):
     assert mixing(chunk.all()) > 0
 
 
-def test_only_the_first_task_is_compiled(tmp_path):
+def test_only_the_first_task_is_compiled_and_buffers_go_early(tmp_path, monkeypatch):
     compiled = 0
-    after = []
+    after, held = [], {0: [], 1: []}
+    # Of a buffer's observations and of its actions.
+    shape = (2, 41, 16, 2)
+    select = Run.select
+
+    def looking(self, now, learner, task, phase):
+        held[phase].append([x.shape for x in jax.live_arrays()].count(shape))
+        return select(self, now, learner, task, phase)
+
+    monkeypatch.setattr(Run, "select", looking)
 
     def listen(event, *_, **__):
         nonlocal compiled
@@ -184,6 +194,8 @@ def test_only_the_first_task_is_compiled(tmp_path):
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert after[0] == after[1] == after[2]
+    # There when candidates are rolled out at a task's start, gone at its end.
+    assert held == {0: [2, 2, 2], 1: [0, 0, 0]}
     # Nine functions of a run, and what a few numbers before and after them take.
     assert 6 < after[0] < 25
     # On a CPU there is no memory but the process's.

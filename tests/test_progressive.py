@@ -1,15 +1,20 @@
+import itertools
 import operator
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewire_jax import networks
+from rewire_jax import networks, rollout
 from rewire_jax.errors import UserError
+from rewire_jax.memory import size
 from rewire_jax.methods import progressive
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.base import Spec, map_own
 from rewire_jax.methods.progressive import PnnSettings
+from rewire_jax.plan import prepare
+from tests.tiny import tiny
 
 WIDTH, TASKS = 4, 4
 SPEC = Spec(observations=3, actions=2, hidden=7, depth=2, tasks=TASKS)
@@ -265,3 +270,52 @@ def test_presets_and_settings():
     assert progressive.preset("ant/forgetting", 4, "quick").width == 48
     with pytest.raises(UserError, match="--width"):
         PnnSettings(width=0).checked()
+
+
+def test_policies_of_all_tasks_hold_the_columns_once():
+    def bytes_of(tasks):
+        plan = prepare(replace(tiny(method="pnn"), seeds=3, tasks=tasks))
+        learner = jax.eval_shape(plan.program.init, plan.members)
+        policies = jax.eval_shape(plan.program.policies, plan.members, learner)
+        return size(policies), size(learner.memory.columns)
+
+    for tasks in (1, 2, 3):
+        policies, columns = bytes_of(tasks)
+        assert policies == columns + 3 * tasks * 4  # a place for each
+
+
+def test_policies_that_share_play_as_each_alone():
+    plan = prepare(tiny(method="pnn"))
+    program, members, tasks = plan.program, plan.members, plan.tasks
+    learner = program.init(members)
+    for stage in range(plan.spec.tasks):
+        params, memory = jax.vmap(
+            lambda key, params, memory, t=stage: pnn_of(plan).start_task(
+                key, params, memory, t
+            )
+        )(members.keys, learner.params, learner.memory)
+        learner = learner._replace(params=params, memory=memory)
+        learner = program.finish(members, learner, stage, None)
+    keys = jax.vmap(lambda key: jax.random.split(key, len(plan.names)))(members.keys)
+    together = program.rollout(
+        tasks, program.policies(members, learner), keys, 2
+    ).returns
+    for place, row in itertools.product(range(plan.places), range(len(plan.names))):
+        mine = jax.tree.map(lambda x, p=place: x[p], (learner.params, learner.memory))
+        policy = pnn_of(plan).policy(*mine, jnp.asarray(row))
+        stacked = jax.tree.map(lambda x: x[None], policy)
+        stacked = map_own(lambda x: x[None], stacked)
+        alone = rollout.episodes(
+            plan.scenario.environment,
+            progressive.act,
+            jax.tree.map(lambda x, r=row: x[r : r + 1], tasks),
+            stacked,
+            keys[place : place + 1, row : row + 1],
+            2,
+        )
+        np.testing.assert_allclose(alone.returns[0, 0], together[place, row], rtol=1e-4)
+    assert len(set(np.asarray(together).ravel().tolist())) > plan.places
+
+
+def pnn_of(plan):
+    return progressive.pnn(plan.spec, plan.settings.options)

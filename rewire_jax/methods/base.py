@@ -17,7 +17,7 @@ Label = Any
 Context = Any
 """Pytree of what a method draws for one update or one acting step."""
 Policy = Any
-"""Pytree from which `Method.act` computes actions."""
+"""Pytree from which `Method.act` computes actions; parts of it may be `Shared`."""
 Purpose = Literal["act", "critic", "policy"]
 """What a context is drawn for: a step, the critics' update, the policy's."""
 
@@ -68,6 +68,30 @@ class Candidates(NamedTuple):
 
     policies: Policy
     valid: jax.Array
+
+
+class Shared(NamedTuple):
+    """A part that is the same in all of a member's policies, and stored once."""
+
+    value: Any
+
+
+def map_own(function: Callable[[jax.Array], Any], policies: Any) -> Any:
+    """Maps the arrays of stacked policies, but for what they share."""
+    return jax.tree.map(
+        lambda x: x if isinstance(x, Shared) else function(x), policies, is_leaf=_shared
+    )
+
+
+def axes(policies: Any) -> Any:
+    """For `vmap` over stacked policies: 0, but None for what they share."""
+    return jax.tree.map(
+        lambda x: None if isinstance(x, Shared) else 0, policies, is_leaf=_shared
+    )
+
+
+def _shared(part: Any) -> bool:
+    return isinstance(part, Shared)
 
 
 class Selection(NamedTuple):

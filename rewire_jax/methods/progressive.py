@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from rewire_jax import networks
 from rewire_jax.config import require, settings
-from rewire_jax.methods.base import Method, Spec, at, count, put, tile
+from rewire_jax.methods.base import Method, Shared, Spec, at, count, put, tile
 from rewire_jax.networks import Linear
 
 
@@ -85,11 +85,11 @@ class Policy(NamedTuple):
     """One of the finished columns.
 
     Attributes:
-      columns: `[tasks, ...]`.
+      columns: `[tasks, ...]`, the same for all tasks.
       place: `[]`, that of the column whose output is the policy's.
     """
 
-    columns: Column
+    columns: Shared
     place: jax.Array
 
 
@@ -137,7 +137,7 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
     def policy(params, memory, task):
         del params
         latest = jnp.maximum(memory.learned - 1, 0)
-        return Policy(memory.columns, jnp.minimum(task, latest))
+        return Policy(Shared(memory.columns), jnp.minimum(task, latest))
 
     def size(params, memory):
         columns = jnp.maximum(memory.learned, 1)
@@ -160,8 +160,8 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
 
 def act(policy: Policy, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std, each `[..., actions]`, of a frozen column."""
-    column = at(policy.columns, policy.place)
-    return play(policy.columns, column, policy.place, observation)
+    (columns,), place = policy
+    return play(columns, at(columns, place), place, observation)
 
 
 def play(
