@@ -25,6 +25,7 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 add_module_names = False
 napoleon_use_ivar = True
+napoleon_attr_annotations = False  # The signature has them.
 python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 
@@ -39,8 +40,14 @@ def _skip(app: Any, what: str, name: str, each: Any, skip: bool, options: Any) -
     return skip or (each.__doc__ or "").startswith("Alias for field number")
 
 
+def _fields(app: Any, what: str, name: str, each: Any, *rest: Any) -> Any:
+    """Leaves out a named tuple's signature, too: functions as defaults fill pages."""
+    return ("", None) if hasattr(each, "_fields") else None
+
+
 def setup(app: Any) -> None:
     """Drawings and tables are made whenever the documentation is built."""
     app.connect("builder-inited", lambda app: drawings.write(ROOT / "docs/drawings"))
     app.connect("source-read", made.fill)
     app.connect("autodoc-skip-member", _skip)
+    app.connect("autodoc-process-signature", _fields)

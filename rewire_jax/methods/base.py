@@ -19,7 +19,7 @@ Context = Any
 Policy = Any
 """Pytree from which `Method.act` computes actions; parts of it may be `Shared`."""
 Purpose = Literal["act", "critic", "policy"]
-"""What a context is drawn for: a step, the critics' update, the policy's."""
+"""What a context is drawn for, which is a step or an update of critics or policy."""
 
 
 class Spec(NamedTuple):
