@@ -293,8 +293,9 @@ def updates(
     """
 
     def one(number, carry):
-        draw = jax.tree.map(lambda x: x[number], draws)
-        return update(*carry, batch(number), draw, first + number, method, sac)
+        learner, metrics = carry
+        draw, made = jax.tree.map(lambda x: x[number], draws), first + number
+        return update(learner, metrics, batch(number), draw, made, method, sac)
 
     draw = jax.tree.map(lambda x: x[0], draws)
     metrics = no_metrics(learner, batch(jnp.asarray(0)), draw, method, sac)
