@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
 
-from rewire_jax import noise, training
+from rewire_jax import noise, rollout, training
 from rewire_jax.config import require
-from rewire_jax.envs.base import Environment
+from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import map_own
 from rewire_jax.plan import Plan
@@ -70,7 +70,6 @@ def need(plan: Plan) -> Need:
     fresh = jax.eval_shape(program.init, plan.members)
     alive = jax.ShapeDtypeStruct((plan.places,), bool)
     state = program.expect(plan.members, fresh, alive, 0, task)
-    policies = jax.eval_shape(program.policies, plan.members, fresh)
 
     def learn(member, state):
         return training.learn(
@@ -85,37 +84,39 @@ def need(plan: Plan) -> Need:
             settings=member.sac,
         )
 
-    def one(tree: Any) -> Any:
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), tree)
-
-    member, mine, policies = one(plan.members), one(state), one(policies)
-    episode = 0  # on the host it takes nothing of the device
-    if isinstance(environment, Environment):
-        simulate = environment.step
-
-        def step(member, task, policy, now):
-            mean, _ = make(spec, member.options).act(policy, now.observation)
-            return simulate(task, now, mean)
-
-        start = jax.eval_shape(environment.reset, task, member.keys)
-        policy = map_own(one, policies)
-        episode = max(
-            peak(environment.reset, task, member.keys),
-            size(start) + peak(step, member, task, policy, start),
+    def cut(tree: Any, *shape: int, axes: int = 1) -> Any:
+        """Shapes whose first `axes` axes are replaced."""
+        return jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((*shape, *x.shape[axes:]), x.dtype), tree
         )
+
+    def play(policies: Any, rows: int, episodes: int) -> int:
+        """For a member's policies, in as many tasks, and episodes of each of these."""
+        policies = map_own(lambda x: cut(x, 1, rows, axes=2), cut(policies, 1))
+        if isinstance(environment, HostEnvironment):
+            return size(policies)  # episodes take nothing of the device
+        act = make(spec, settings.options).act
+
+        def roll(tasks, policies, keys):
+            return rollout.episodes(environment, act, tasks, policies, keys, episodes)
+
+        keys = cut(plan.members.keys, 1, rows)
+        return size(policies) + peak(roll, cut(plan.tasks, rows), policies, keys)
+
+    member, mine = cut(plan.members), cut(state)
+    policies = jax.eval_shape(program.policies, plan.members, fresh)
     learner = size(mine.learner)
     work = [
         learner,  # a task's start and end each make one from the other
         peak(learn, member, mine),
-        episode * settings.envs,
+        play(policies, 1, settings.envs),
     ]
     if program.consolidate:
         work.append(peak(program.consolidate, plan.members, state, 0, 1) // plan.places)
     selection = 0
     if program.candidates and plan.rows:
-        chosen = one(jax.eval_shape(program.candidates, plan.members, fresh, 0))
-        share = size(chosen.policies) // chosen.valid.size
-        selection = plan.rows * (share + episode * settings.selection_episodes)
+        chosen = jax.eval_shape(program.candidates, plan.members, fresh, 0)
+        selection = play(chosen.policies, plan.rows, settings.selection_episodes)
     if program.baseline:
         work.append(selection)
     environments = size(mine.collection) - size(mine.collection.buffer)
@@ -135,8 +136,7 @@ def need(plan: Plan) -> Need:
         environments=environments,
         work=max(work),
         evaluation=max(
-            size(policies) + episode * settings.tasks * settings.eval_episodes,
-            selection,
+            play(policies, settings.tasks, settings.eval_episodes), selection
         ),
     )
 

@@ -6,11 +6,14 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from experiments import memory_needs
 from rewire_jax import memory
 from rewire_jax.config import Settings
 from rewire_jax.errors import UserError
 from rewire_jax.methods import METHODS
 from rewire_jax.plan import Plan, prepare
+from rewire_jax.presets import preset
+from rewire_jax.scenarios import make_scenario
 from tests.tiny import tiny
 
 FOUR = 4  # bytes of a number
@@ -56,8 +59,17 @@ def test_estimate_is_near_what_is_compiled(seeds):
     plan = prepare(settings(seeds=seeds))
     need, (training, evaluation) = memory.need(plan), planned(plan)
     estimate = need.learner + need.buffer + need.environments + need.work
-    assert training / 1.3 < estimate < training * 1.3
+    # With more members XLA fuses more.
+    assert training / 1.3 < estimate < training * 1.4
     assert evaluation / 1.3 < need.evaluation < evaluation * 1.3
+
+
+def test_a_share_of_all_policies_is_paid_for_once():
+    small = settings("pnn", tasks=4)
+    options = replace(small.options, width=64)
+    plan = prepare(replace(small, options=options))
+    need, (_, evaluation) = memory.need(plan), planned(plan)
+    assert evaluation / 1.5 < need.evaluation < evaluation * 1.5
 
 
 def test_members_need_the_same_together_as_alone():
@@ -214,3 +226,13 @@ def test_machine_gives_no_more_than_its_control_groups(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(written + "\n")
     assert memory.machine_bytes(tmp_path) == (limit or whole)
+
+
+def test_table_of_needs_has_what_is_counted():
+    scenario = make_scenario("probe/reach")
+    row = memory_needs.count(scenario, "ft1", envs=32)
+    plan = prepare(replace(preset(scenario, "ft1"), envs=32, seeds=1), scenario)
+    assert row["total"] == memory.need(plan).total
+    head, line = memory_needs.table([row])
+    assert line[:3] == ["probe/reach", "FT-1", "32"]
+    assert dict(zip(head, line, strict=True))["total"] == f"{row['total'] / 1e6:.1f}"

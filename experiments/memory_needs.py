@@ -1,0 +1,90 @@
+"""What a member needs of a device's memory, by method and number of environments.
+
+Nothing is trained or compiled: `rewire_jax.memory` counts it from shapes and traces.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import rewire_jax
+from experiments import suite
+from rewire_jax import memory
+from rewire_jax.methods import METHODS
+from rewire_jax.plan import prepare
+from rewire_jax.published import NAMES
+
+SCENARIOS = ("halfcheetah/forgetting", "continual_world/t3")
+TITLE = "Memory of a member, in MB"
+READING = (
+    "Counted for the paper profile before anything is compiled: what learning changes, "
+    "the replay buffer, the environments, what is taken for a while beside these in "
+    "training, and beside the learner alone in an evaluation. The most at a time is "
+    "the learner with the larger of training and evaluation. Environments that are "
+    "stepped on the host take nothing of the device."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MemoryNeeds:
+    """What to count.
+
+    Attributes:
+      envs: numbers of environments for which the first method is counted, too.
+      out: the result files, without a suffix.
+    """
+
+    envs: tuple[int, ...] = (64, 256)
+    out: Path = suite.RESULTS / "memory-needs"
+
+
+def count(scenario: rewire_jax.Scenario, method: str, envs: int = 0) -> dict[str, Any]:
+    """A row for a method; `envs` 0 stands for the profile's.
+
+    Args:
+      scenario: that is learned.
+      method: its name.
+      envs: environments of a member.
+    """
+    settings = replace(rewire_jax.preset(scenario, method), seeds=1)
+    settings = replace(settings, envs=envs or settings.envs)
+    need = memory.need(prepare(settings, scenario))
+    return {
+        "scenario": scenario.name,
+        "method": method,
+        "envs": settings.envs,
+        **need._asdict(),
+        "total": need.total,
+    }
+
+
+def rows(envs: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """Every method with the profile's environments, rewire with others."""
+    for name in SCENARIOS:
+        scenario = rewire_jax.make_scenario(name)
+        for method in METHODS:
+            yield count(scenario, method)
+        for number in envs:
+            yield count(scenario, "rewire", number)
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """A line for each row."""
+    parts = [*memory.Need._fields, "total"]
+    lines = [
+        [row["scenario"], NAMES[row["method"]], str(row["envs"])]
+        + [f"{row[part] / 1e6:.1f}" for part in parts]
+        for row in rows
+    ]
+    return [["scenario", "method", "environments", *parts], *lines]
+
+
+def run(job: MemoryNeeds) -> None:
+    """Counts all and writes it."""
+    made = list(rows(job.envs))
+    suite.write(job.out, TITLE, table(made), (READING,), made)
+
+
+if __name__ == "__main__":
+    suite.command(MemoryNeeds, run, "memory_needs")
