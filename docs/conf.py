@@ -30,6 +30,8 @@ python_maximum_signature_line_length = 88
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_title = "rewire_jax"
 html_copy_source = False
 html_show_copyright = False

@@ -86,7 +86,7 @@ def shown(value: Any) -> str:
 def argument(item: Item) -> str:
     """The flag, or the name where an argument goes by its place."""
     marks = getattr(item.kind, "__metadata__", ())
-    placed = any("POSITIONAL" in str(mark).upper() for mark in marks)
+    placed = tyro.conf.Positional in marks
     return f"`{item.name.upper() if placed else config.flag(item.name)}`"
 
 
