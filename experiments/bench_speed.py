@@ -104,7 +104,7 @@ def run(bench: Bench) -> dict[str, Any]:
     device = jax.devices()[0].device_kind.lower().replace(" ", "-")
     results = Path("runs") if bench.quick else suite.RESULTS
     folder = bench.out or results / f"speed-{device}"
-    folder.mkdir(parents=True, exist_ok=True)
+    runfolder.make(folder)
     path = folder / "result.json"
     found = json.loads(path.read_text()) if path.exists() else {}
     for name in chosen:

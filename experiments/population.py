@@ -18,7 +18,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from matplotlib.ticker import NullLocator, ScalarFormatter
 
 import rewire_jax
 from experiments import suite
@@ -174,10 +173,7 @@ def draw(rows: Sequence[Mapping[str, Any]], key: str, path: Path) -> None:
     members = [row["members"] for row in rows]
     times = [1e3 * row[key] for row in rows]
     axes.plot(members, times, marker="o", **figures.look(0))
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(members)
-    axes.xaxis.set_major_formatter(ScalarFormatter())
-    axes.xaxis.set_minor_locator(NullLocator())
+    figures.doubling(axes, members)
     axes.set_ylim(0, 1.1 * max(times))
     axes.set_xlabel("members side by side")
     axes.set_ylabel("ms a member and interaction")

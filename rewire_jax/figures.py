@@ -210,6 +210,12 @@ def entitle(figure: Figure, title: str, reading: str) -> None:
     figure.suptitle("\n".join(lines), fontsize=11)
 
 
+def doubling(axes: Axes, values: Sequence[int]) -> None:
+    """A horizontal axis of numbers that double, with a tick for each."""
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(values, [str(value) for value in values])
+
+
 def look(i: int) -> dict[str, Any]:
     """Colour and line style of the method at a place, the same in all pictures."""
     style = _STYLES[i // _ALIKE % len(_STYLES)]

@@ -145,9 +145,9 @@ def draw(
 
 def labels(replay: Replay, places: jax.Array, time: jax.Array) -> Any:
     """What was stored beside the transitions at some places, see `take`."""
-    rows, envs = replay.reward.shape
-    row = (time - 1 - places // envs) % rows
-    return jax.tree.map(lambda a: a[row, places % envs], replay.label)
+    at, env = _find(replay, places, time)
+    row = at % len(replay.reward)
+    return jax.tree.map(lambda a: a[row, env], replay.label)
 
 
 def take(
@@ -161,8 +161,8 @@ def take(
       time: `[]` int, the number of time steps stored so far, at least 1.
       episode_length: as in `create`.
     """
-    rows, envs = replay.reward.shape
-    at, env = time - 1 - places // envs, places % envs
+    rows = len(replay.reward)
+    at, env = _find(replay, places, time)
     row = at % rows
     cut = (at // episode_length) % replay.final.shape[0]
     truncated = replay.truncated[row, env]
@@ -179,6 +179,12 @@ def take(
         ),
         label=labels(replay, places, time),
     )
+
+
+def _find(replay, places, time):
+    """Times and environments of some places."""
+    envs = replay.reward.shape[1]
+    return time - 1 - places // envs, places % envs
 
 
 def sample(

@@ -195,18 +195,20 @@ def _actor(learner: Learner) -> _Actor:
     )
 
 
-def no_metrics(
+def no_metrics(update: Callable[..., tuple[Any, Metrics]], *arguments: Any) -> Metrics:
+    """Zeros in the shape of the metrics that updates give beside what they change."""
+    _, shapes = jax.eval_shape(update, *arguments)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def first_metrics(
     learner: Learner, batch: Batch, draw: Draw, method: Method, sac: SacSettings
 ) -> Metrics:
-    """Zeros in the shape of an update's metrics, to carry through a loop."""
-    shapes = jax.eval_shape(
-        lambda: _update_policy(_actor(learner), learner, batch, draw, method, sac)[1]
+    """What `update` is given before there was one; zeros."""
+    policy = no_metrics(
+        lambda: _update_policy(_actor(learner), learner, batch, draw, method, sac)
     )
-    return {
-        "critic_loss": jnp.zeros(()),
-        "q": jnp.zeros(()),
-        **jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes),
-    }
+    return {"critic_loss": jnp.zeros(()), "q": jnp.zeros(()), **policy}
 
 
 def _every(delay, count, change, keep, value):
@@ -298,5 +300,5 @@ def updates(
         return update(learner, metrics, batch(number), draw, made, method, sac)
 
     draw = jax.tree.map(lambda x: x[0], draws)
-    metrics = no_metrics(learner, batch(jnp.asarray(0)), draw, method, sac)
+    metrics = first_metrics(learner, batch(jnp.asarray(0)), draw, method, sac)
     return jax.lax.fori_loop(0, count, one, (learner, metrics))

@@ -218,7 +218,7 @@ def learn(
         0,
         jnp.asarray(due, jnp.int32),
         lambda _, carry: learned(carry[0]),
-        (state.learner, no_metrics(learned, state.learner)),
+        (state.learner, sac.no_metrics(learned, state.learner)),
     )
     alive = state.alive & all_finite(
         (learner.params, learner.critic, learner.log_temperature)
@@ -328,7 +328,7 @@ def train(
         none,
         none,
         none,
-        no_metrics(update, key, state, time),
+        sac.no_metrics(update, key, state, time),
         {},
         rollout.Success(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
         if environment.success
@@ -340,12 +340,6 @@ def train(
     state, report, _ = jax.lax.fori_loop(time, end, step, carry)
     inspected = inspect(key, state, end, length, method, settings)
     return state, report._replace(inspected=inspected)
-
-
-def no_metrics(update: Any, *arguments: Any) -> sac.Metrics:
-    """Zeros in the shape of the metrics that an update gives beside the state."""
-    _, shapes = jax.eval_shape(update, *arguments)
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
 
 def inspect(

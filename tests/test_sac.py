@@ -96,7 +96,7 @@ def learner_and_batch(settings=SETTINGS):
         truncated=(np.arange(size) >= 2) & (np.arange(size) < 4),
         next_observation=numbers[:, 3:6],
     )
-    metrics = sac.no_metrics(learner, batch, drawn(batch), METHOD, settings)
+    metrics = sac.first_metrics(learner, batch, drawn(batch), METHOD, settings)
     return learner, batch, metrics
 
 

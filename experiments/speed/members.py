@@ -33,8 +33,7 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     members = [row["members"] for row in rows]
     rates = [row["updates_per_second"] for row in rows]
     axes.plot(members, rates, marker="o", **figures.look(0))
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(members, [str(count) for count in members])
+    figures.doubling(axes, members)
     axes.set_ylim(0, None)
     axes.set_xlabel("members side by side")
     axes.set_ylabel("updates a second, all together")

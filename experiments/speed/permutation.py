@@ -78,9 +78,8 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     ):
         times = [row[f"{name}_ms"] for row in rows]
         axes.plot(widths, times, marker="o", label=label, **figures.look(i))
-    axes.set_xscale("log", base=2)
+    figures.doubling(axes, widths)
     axes.set_yscale("log")
-    axes.set_xticks(widths, [str(width) for width in widths])
     axes.set_xlabel("neurons")
     axes.set_ylabel("ms, forward and backward")
     axes.legend(frameon=False)

@@ -46,8 +46,7 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     widths = [row["hidden"] for row in rows]
     costs = [row["cost"] for row in rows]
     axes.plot(widths, costs, marker="o", **figures.look(0))
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(widths, [str(width) for width in widths])
+    figures.doubling(axes, widths)
     axes.set_ylim(0, None)
     axes.set_xlabel("neurons in a hidden layer")
     axes.set_ylabel("cost of a rewire update, in plain ones")
