@@ -12,7 +12,7 @@ from rewire_jax.published import Figures
 from rewire_jax.summary import Comparison, Interval, Spread, Summary
 
 # Columns of words are set to the left, all others to the right.
-WORDS = frozenset(("method", "task", "seeds", "device"))
+WORDS = frozenset(("method", "task", "seeds", "device", "fault"))
 
 
 class Table(NamedTuple):

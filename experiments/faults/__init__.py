@@ -1,0 +1,1 @@
+"""Faults, each tried on the real command: the parts of `try_faults.py`."""
