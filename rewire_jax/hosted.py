@@ -46,12 +46,11 @@ class _Functions(NamedTuple):
     Attributes:
       roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
       begin: `(members, learner, alive, index, episodes) -> State`.
-      sequence: `(members, index, time) -> ` coloured noise, on the CPU.
-      keys: `(members, index, time) -> [members, every, 2]` uint32, those of the next
-        steps' actions.
-      act: `(members, key, acting, label, observation, steps, time, sequence, random)
-        -> actions, label`, on the CPU: it then waits for no other device's updates;
-        `random` is static, steps of the task that begin with uniform actions.
+      draws: `(members, index, time) -> exploring.Draw` `[members, every]`, of the
+        next steps: drawn for each alone, they would take half of an action's time.
+      act: `(members, draws, number, acting, label, observation, steps) -> actions,
+        label`, by the draw with that number; on the CPU, where it waits for no other
+        device's updates.
       absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
         buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
         are due after them; what is given is used up, but for the learner with overlap.
@@ -60,8 +59,7 @@ class _Functions(NamedTuple):
 
     roots: Callable[..., jax.Array]
     begin: Callable[..., training.State]
-    sequence: Callable[..., jax.Array]
-    keys: Callable[..., jax.Array]
+    draws: Callable[..., exploring.Draw]
     act: Callable[..., tuple[jax.Array, Any]]
     absorb: Callable[..., tuple[Any, Any, Any, Any]]
     inspect: Callable[..., dict[str, jax.Array]]
@@ -130,32 +128,24 @@ def _compile(
     def roots(member, index):
         return jax.random.key_data(jax.random.split(task_keys(member, index)[0], 4)[1])
 
-    def sequence(member, index, time):
-        key = task_keys(member, index)[1]
-        return exploring.draw_sequence(key, time, size, length, member.sac)
+    def draws(member, index, time):
+        key, sac = task_keys(member, index)[1], member.sac
 
-    def keys(member, index, time):
         def of(now):
-            key = jax.random.fold_in(task_keys(member, index)[1], now)
-            return jax.random.key_data(jax.random.split(key)[0])
+            sequence = None
+            if sac.noise_color:
+                sequence = exploring.draw_sequence(key, now, size, length, sac)
+            collect_key, _ = jax.random.split(jax.random.fold_in(key, now))
+            return exploring.draw(collect_key, now, size, shape.random, sequence)
 
         return jax.vmap(of)(time + jnp.arange(shape.every))
 
-    def act(members, key, acting, label, observation, steps, time, sequence, random):
-        def one(member, key, acting, label, observation, steps, sequence):
-            return exploring.explore(
-                jax.random.wrap_key_data(key),
-                acting,
-                label,
-                observation,
-                steps,
-                time,
-                make(member),
-                random,
-                sequence,
-            )
+    def act(members, draws, number, acting, label, observation, steps):
+        def one(member, draws, *arguments):
+            draw = jax.tree.map(lambda leaf: leaf[number], draws)
+            return exploring.explore(draw, *arguments, make(member))
 
-        return jax.vmap(one)(members, key, acting, label, observation, steps, sequence)
+        return jax.vmap(one)(members, draws, acting, label, observation, steps)
 
     def absorb(member, learner, buffer, alive, index, time, played):
         def store(number, buffer):
@@ -187,10 +177,9 @@ def _compile(
     return _Functions(
         roots=over(roots, 0, None),
         begin=over(begin, 0, 0, 0, None, 0),
-        sequence=jax.jit(jax.vmap(sequence, (0, None, None))),
-        keys=over(keys, 0, None, None),
+        draws=over(draws, 0, None, None),
         # Called at each step, and so not through `shard_map`, which takes its time.
-        act=jax.jit(act, static_argnames="random"),
+        act=jax.jit(act),
         # With overlap the former learner acts meanwhile, and must be left.
         absorb=over(
             absorb, 0, 0, 0, 0, None, None, 0, donate=(2,) if shape.overlap else (1, 2)
@@ -224,30 +213,22 @@ def _chunk(
     here = functools.partial(jax.device_put, device=cpu)
     actors, label = here(members), here(label)
     acting = here(acting or (learner.params, learner.memory))
-    colored = bool(members.sac.noise_color)
-    sequence: Any = None
     learning: Any = None
     made, metrics, updates = [], [], 0
     # JAX begins what one thread asks for in turn: actions would wait for updates.
     with ThreadPoolExecutor(1) as other:
         for start in range(time, time + steps, shape.every):
             played = []
-            keys = np.asarray(functions.keys(members, index, start))
-            for now in range(start, start + shape.every):
-                if colored and (sequence is None or now % len(sequence[0]) == 0):
-                    sequence = functions.sequence(actors, index, now)
-                seen = episodes.state.observation
+            draws = here(functions.draws(members, index, start))
+            for number in range(shape.every):
                 drawn, label = functions.act(
                     actors,
-                    keys[:, now - start],
+                    draws,
+                    number,
                     acting,
                     label,
-                    seen,
+                    episodes.state.observation,
                     episodes.steps,
-                    now,
-                    sequence,
-                    # Later none are drawn, which is a third of an action's time.
-                    random=shape.random if now < shape.random else 0,
                 )
                 action = np.asarray(drawn)
                 episodes, step = simulated.advance(

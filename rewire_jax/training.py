@@ -120,16 +120,14 @@ def collect(
 ) -> tuple[Collection, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
     learner, (buffer, episodes, label), *_ = state
+    size = shape.envs, environment.action_size
     action, label = exploring.explore(
-        key,
+        exploring.draw(key, time, size, shape.random, sequence),
         (learner.params, learner.memory),
         label,
         episodes.state.observation,
         episodes.steps,
-        time,
         method,
-        shape.random,
-        sequence,
     )
     length = environment.episode_length
     if environment.varied:

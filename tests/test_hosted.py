@@ -243,16 +243,14 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
     method = find_method("ft1").make(plan.spec, plan.settings.options)
 
     def acted(learner, time):
+        step_key = jax.random.split(jax.random.fold_in(key[1], time))[0]
         action, _ = exploring.explore(
-            jax.random.split(jax.random.fold_in(key[1], time))[0],
+            exploring.draw(step_key, jnp.asarray(time), (1, 2), 0, None),
             jax.tree.map(lambda x: x[0], (learner.params, learner.memory)),
             (),
             final.observation[0, time],
             jnp.zeros(1, jnp.int32),
-            jnp.asarray(time),
             method,
-            0,
-            None,
         )
         return action
 

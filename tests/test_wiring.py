@@ -75,18 +75,20 @@ def test_spread_sorts_into_its_order_evenly():
     np.testing.assert_array_equal(wiring.spread(jnp.zeros((2, 1), jnp.int32)), 0)
 
 
-def test_wired_network_equals_permuted_activations(double):
-    # Eq. 2 with dense matrices on the activations, against permuted weights.
+@pytest.mark.parametrize("batch", [BATCH, 2 * N])
+def test_wired_network_equals_permuted_activations(double, batch):
+    # Eq. 2 with dense matrices on the activations. The smaller batch has its
+    # activations permuted in all layers but the first, the larger one in none.
     rng = np.random.default_rng(1)
     hidden, head = make_hidden(rng, 3), make_layers(rng, [N, OUTPUTS])[0]
     scores = sorting_into(rng, make_orders(rng, 3))
-    observation = rng.normal(size=(BATCH, OBSERVATIONS))
-    weight = rng.normal(size=(BATCH, OUTPUTS))
+    observation = rng.normal(size=(batch, OBSERVATIONS))
+    weight = rng.normal(size=(batch, OUTPUTS))
 
     def wired(hidden, head, scores, tau):
         x = observation
-        for layer in wiring.wire(hidden, scores, tau):
-            x = networks.activate(networks.affine(layer, x))
+        for layer, v in zip(hidden, scores, strict=True):
+            x = networks.activate(wiring.wired(layer, v, tau, x))
         return networks.affine(head, x)
 
     def dense(hidden, head, scores, tau):
@@ -110,16 +112,18 @@ def test_wired_network_equals_permuted_activations(double):
         assert np.all(np.max(np.abs(got[1][2]), axis=-1) > 0)
 
 
-def test_fold_is_the_value_of_wire(double):
+@pytest.mark.parametrize("batch", [1, N])
+def test_fold_has_the_value_of_wired(double, batch):
     rng = np.random.default_rng(2)
     hidden, orders = make_hidden(rng, 3), make_orders(rng, 3)
-    wired = wiring.wire(hidden, jnp.asarray(sorting_into(rng, orders)), 0.1)
+    scores = jnp.asarray(sorting_into(rng, orders))
     folded = wiring.fold(hidden, orders)
-    for a, b, layer, z in zip(wired, folded, hidden, orders, strict=True):
-        np.testing.assert_array_equal(a.weight, b.weight)
-        np.testing.assert_array_equal(a.bias, b.bias)
-        np.testing.assert_array_equal(b.weight, matrix(z) @ layer.weight)
-        np.testing.assert_array_equal(b.bias, matrix(z) @ layer.bias)
+    for plain, v, layer, z in zip(hidden, scores, folded, orders, strict=True):
+        np.testing.assert_array_equal(layer.weight, matrix(z) @ plain.weight)
+        np.testing.assert_array_equal(layer.bias, matrix(z) @ plain.bias)
+        x = rng.normal(size=(batch, plain.weight.shape[1]))
+        value = wiring.wired(plain, v, 0.1, x)
+        np.testing.assert_allclose(value, networks.affine(layer, x), rtol=1e-12)
 
 
 def realigned(rng, depth):

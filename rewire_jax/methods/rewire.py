@@ -243,9 +243,9 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
 
     def forward(params, memory, scores, key, observation):
         x = observation
-        for layer in wiring.wire(params.hidden, scores, options.tau):
+        for layer, v in zip(params.hidden, scores, strict=True):
             key, drop_key = jax.random.split(key)
-            x = networks.affine(layer, x)
+            x = wiring.wired(layer, v, options.tau, x)
             # The authors drop out before the permutation: the same but for the variance
             # of the scores' gradient.
             x = _dropout(drop_key, x, options.dropout)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from rewire_jax.networks import Linear
+from rewire_jax.networks import Linear, affine
 from rewire_jax.permutation import permute, permute_rows
 
 Hidden = Sequence[Linear]
@@ -55,15 +55,20 @@ def permute_outputs(layer: Linear, scores: jax.Array, tau: ArrayLike) -> Linear:
     return Linear(*permute_rows(list(layer), scores, tau))
 
 
-def wire(hidden: Hidden, scores: jax.Array, tau: ArrayLike) -> list[Linear]:
-    """All hidden layers with their outputs permuted by scores `[L, n]` (Eq. 2)."""
-    return [
-        permute_outputs(layer, v, tau) for layer, v in zip(hidden, scores, strict=True)
-    ]
+def wired(layer: Linear, scores: jax.Array, tau: ArrayLike, x: jax.Array) -> jax.Array:
+    """A layer's output `[..., n]` for x `[..., inputs]`, in the order of scores `[n]`.
+
+    Eq. 2, before the activation. A large batch is spared by permuting the weights, a
+    small one is permuted itself: value and gradients are the same.
+    """
+    batch, inputs = x.size // x.shape[-1], x.shape[-1]
+    if batch < inputs:
+        return permute(affine(layer, x), scores, tau)
+    return affine(permute_outputs(layer, scores, tau), x)
 
 
 def fold(hidden: Hidden, orders: jax.Array) -> list[Linear]:
-    """The same for fixed orders `[L, n]`."""
+    """All layers with their outputs in fixed orders `[L, n]`, an ordinary MLP's."""
     return [Linear(w[z], b[z]) for (w, b), z in zip(hidden, orders, strict=True)]
 
 
