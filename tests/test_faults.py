@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.faults.base import Case, Kind
+from experiments.faults.base import Case, Impossible, Kind
 from experiments.try_faults import KINDS
 
 CASES = [
@@ -23,5 +23,8 @@ def test_no_fault_costs_a_result(kind: Kind, number: int, root: Path) -> None:
     case: Case = kind.cases[number]
     folder = root / f"{kind.name}-{number}"
     folder.mkdir()
-    came = case.run(folder)
+    try:
+        came = case.run(folder)
+    except Impossible as why:
+        pytest.skip(str(why))
     assert came.ok, came

@@ -37,6 +37,10 @@ TRAIN = ("train", "probe/reach", *FLAGS)
 _QUICKLY = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
+class Impossible(Exception):
+    """A case that cannot be tried on this machine; the message says why."""
+
+
 class Outcome(NamedTuple):
     """What came of a case.
 
@@ -61,8 +65,8 @@ class Case(NamedTuple):
 
     Attributes:
       name: unlike the other cases' of its kind.
-      run: given a folder of its own, new and empty, tries the fault. What cases can
-        share is beside that folder; see `unbroken`.
+      run: given a folder of its own, new and empty, tries the fault, or raises
+        `Impossible`. What cases can share is beside that folder; see `unbroken`.
     """
 
     name: str
@@ -106,10 +110,16 @@ def words(arguments: Sequence[str | Path]) -> list[str]:
     return [sys.executable, "-m", "rewire_jax.cli", *map(str, arguments)]
 
 
-def run(*arguments: str | Path, **others: str) -> Ran:
-    """Runs `rewire-jax` in a process of its own; `others` are environment variables."""
+def run(*arguments: str | Path, before: Sequence[str] = (), **others: str) -> Ran:
+    """Runs `rewire-jax` in a process of its own.
+
+    Args:
+      arguments: of the command.
+      before: words of a command that runs it.
+      others: environment variables.
+    """
     done = subprocess.run(
-        words(arguments),
+        [*before, *words(arguments)],
         capture_output=True,
         text=True,
         env=environment() | others,
