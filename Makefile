@@ -27,12 +27,13 @@ option = $(if $(strip $(2)),--$(1) $(2))
 .DELETE_ON_ERROR:
 .PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
 	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
-	docs clean
+	follow-readme docs clean
 
 help: ## Say what there is
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' Makefile
 	@echo 'bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS TASKS' \
-		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS.'
+		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS,' \
+		'follow-readme ONLY SKIP FOLDER KEEP.'
 
 setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
 
@@ -132,8 +133,15 @@ bench-speed: setup ## Measure what is fast and slow, and peers after setup-bench
 bench-mjx: setup-mjx ## Measure steps a second of Meta-World on MJX-Warp
 	$(RUN) -m experiments.bench_mjx
 
-readme: setup ## Make the tables of README.md anew from experiments/results
+readme: setup ## Make the tables of README.md and docs anew from experiments/results
 	$(RUN) -m experiments.readme
+
+follow-readme: setup ## Follow README.md in an empty folder, word for word
+	$(RUN) -m experiments.follow_readme $(strip \
+		$(call option,only,$(ONLY)) \
+		$(call option,skip,$(SKIP)) \
+		$(call option,folder,$(FOLDER)) \
+		$(if $(KEEP),--keep))
 
 docs: setup ## Build the documentation into site/, warnings being errors
 	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --fresh-env \

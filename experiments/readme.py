@@ -1,46 +1,82 @@
-"""Puts committed results into the README, between its markers.
+"""Puts committed results into the README and the pages, between their markers.
 
 `<!-- results: NAME -->` and `<!-- end -->` enclose what is made from
 `experiments/results/NAME/report.md`, or from `experiments/results/NAME.md`.
+`<!-- results: NAME | HEAD | HEAD -->` takes no more than the title and the first table,
+and of that the columns whose headings begin so.
 """
 
+import itertools
+import os
 import re
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rewire_jax.errors import UserError
 
-README = Path("README.md")
+PAGES = (Path("README.md"), Path("docs/results.md"), Path("docs/speed.md"))
 RESULTS = Path("experiments/results")
-_BLOCK = re.compile(r"(<!-- results: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_BLOCK = re.compile(
+    r"(<!-- results: (\S+)(?: \| ([^\n]*))? -->\n).*?(<!-- end -->)", re.DOTALL
+)
+_FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
 
-def fill(text: str, results: Path = RESULTS) -> str:
+def fill(text: str, page: Path = PAGES[0], results: Path = RESULTS) -> str:
     """The text with every marked block made anew.
 
+    Args:
+      text: of the page.
+      page: where it lies; links in results are made to lead from there.
+      results: folder of all results.
+
     Raises:
-      UserError: a block names results that are not there.
+      UserError: a block names results, or a column, that are not there.
     """
 
     def block(match: re.Match[str]) -> str:
-        folder = results / match[2]
-        source = folder / "report.md" if folder.is_dir() else results / f"{match[2]}.md"
+        begin, name, heads, end = match.groups()
+        folder = results / name
+        source = folder / "report.md" if folder.is_dir() else results / f"{name}.md"
         try:
             report = source.read_text()
         except OSError as error:
-            raise UserError(f"README.md names {match[2]}: no {source}") from error
-        # A title there is a section's heading here; pictures lie in its folder.
-        report = re.sub(r"^#+ ", "#### ", report, flags=re.MULTILINE)
-        report = re.sub(r"\]\((?!http)", f"]({source.parent.as_posix()}/", report)
-        return f"{match[1]}\n{report.strip()}\n\n{match[3]}"
+            raise UserError(f"{page} names {name}: no {source}") from error
+        if heads:
+            report = _columns(report, heads.split(" | "), name)
+        # A title there is a heading here, one level below its section's.
+        above = _FENCED.sub("", _BLOCK.sub("", text[: match.start()]))
+        level = max([0, *map(len, re.findall(r"^(#+) ", above, re.MULTILINE)[-1:])])
+        report = re.sub(r"^#", "#" * (level + 1), report, flags=re.MULTILINE)
+        way = Path(os.path.relpath(source.parent, page.parent)).as_posix()
+        report = re.sub(r"\]\((?!http)", f"]({way}/", report)
+        return f"{begin}\n{report.strip()}\n\n{end}"
 
     return _BLOCK.sub(block, text)
 
 
+def _columns(report: str, heads: Sequence[str], name: str) -> str:
+    """The title of a report, and these columns of its first table."""
+    title, *lines = report.splitlines()
+    lines = list(itertools.dropwhile(lambda line: not line.startswith("|"), lines))
+    table = itertools.takewhile(lambda line: line.startswith("|"), lines)
+    rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in table]
+    places = []
+    for head in heads:
+        found = [i for i, cell in enumerate(rows[0]) if cell.startswith(head)]
+        if not found:
+            raise UserError(f"{name} has no column that begins with {head!r}")
+        places.append(found[0])
+    picked = ["| " + " | ".join(row[i] for i in places) + " |" for row in rows]
+    return "\n".join([title, "", *picked])
+
+
 def main() -> None:
-    """Rewrites README.md where its results changed."""
+    """Rewrites the pages whose results changed."""
     try:
-        README.write_text(fill(README.read_text()))
+        for page in PAGES:
+            page.write_text(fill(page.read_text(), page))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

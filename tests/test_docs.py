@@ -83,7 +83,7 @@ def test_the_whole_public_face_is_told(site) -> None:
 
 def test_committed_results_are_shown(site) -> None:
     title = (ROOT / "experiments/results/model-sizes.md").read_text().splitlines()[0]
-    assert title.removeprefix("# ") in site["reproduce"]
+    assert title.removeprefix("# ") in site["results"]
     assert "made:" not in "".join(site.values())
 
 
