@@ -45,7 +45,8 @@ class Progress:
         self._total = total
         self._members = tuple(members)
         self._label = label
-        self._console = console or Console(file=file or sys.stderr)
+        # In a notebook Rich would write HTML into the cell instead.
+        self._console = console or Console(file=file or sys.stderr, force_jupyter=False)
         self._live: Live | None = None
 
     def __enter__(self) -> Self:

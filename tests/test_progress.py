@@ -41,6 +41,16 @@ def test_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert "task 2 of 2, moon finished" in captured.err
 
 
+def test_a_notebook_is_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    run(Progress(TASKS, 30_000, ["seed 0", "seed 1"], "rewire"))
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 2
+
+
 def test_dumb_terminal_is_quiet() -> None:
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, _environ={"TERM": "dumb"})
