@@ -1,10 +1,12 @@
 """What every environment of this project looks like: pure functions over pytrees."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
+
+from rewire_jax.film import Film
 
 
 class Task(NamedTuple):
@@ -53,6 +55,8 @@ class Environment(NamedTuple):
       success: whether states tell of success.
       varied: whether every episode in training starts from a reset of its own. Such
         an environment must not end an episode itself.
+      film: `(task, inners) -> Film`, given `State.inner` of each frame; None where
+        there is nothing to see.
     """
 
     reset: Callable[[Task, jax.Array], State]
@@ -62,6 +66,7 @@ class Environment(NamedTuple):
     episode_length: int
     success: bool = False
     varied: bool = False
+    film: Callable[[Task, Sequence[Any]], Film] | None = None
 
 
 class HostEnvironment(NamedTuple):
@@ -76,7 +81,8 @@ class HostEnvironment(NamedTuple):
         the environment. `reset(seed=..., options={"task": index})` begins an episode
         of the task whose `Task.physics` is `index`; `step` takes float32 actions in
         [-1, 1] and tells success, if at all, as `info["success"]`. Observations are
-        float32. It does not truncate.
+        float32. It does not truncate. If it has a `simulation`, that is what can be
+        seen of its episode: `model`, `data` and `dt` as of gymnasium's `MujocoEnv`.
       observation_size: length of an observation.
       action_size: length of an action.
       episode_length: steps after which an episode is cut off.

@@ -8,6 +8,7 @@ stacked and vmapped.
 import copy
 import functools
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import brax.envs
@@ -15,13 +16,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.base import System
+from brax import math
+from brax.base import System, Transform
 from brax.envs.base import PipelineEnv
 from brax.envs.base import State as BraxState
 
 from rewire_jax.envs import changes
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
 from rewire_jax.errors import UserError
+from rewire_jax.film import Film
 
 NAMES = ("halfcheetah", "ant", "humanoid")
 BACKENDS = ("positional", "spring", "generalized", "mjx")
@@ -126,7 +129,26 @@ def _make_environment(env: PipelineEnv) -> Environment:
         observation_size=observation.shape[0],
         action_size=env.action_size,
         episode_length=EPISODE_LENGTH,
+        film=functools.partial(_film, env.dt),
     )
+
+
+def _film(seconds: float, task: Task, inners: Sequence[Any]) -> Film:
+    """What is seen of pipeline states; the geometries have the task's sizes."""
+    system = task.physics
+    model = copy.copy(system.mj_model)
+    model.geom_size[:] = system.geom_size
+    shape = Transform(pos=system.geom_pos, rot=system.geom_quat)
+    link = system.geom_bodyid - 1  # -1 is the world, which comes last.
+
+    def place(x: Transform) -> tuple[jax.Array, jax.Array]:
+        bodies = x.concatenate(Transform.zero((1,)))
+        geoms = bodies.take(link).vmap().do(shape)
+        return geoms.pos, jax.vmap(math.quat_to_3x3)(geoms.rot)
+
+    x = jax.tree.map(lambda *leaves: np.stack(leaves), *[inner.x for inner in inners])
+    position, rotation = jax.jit(jax.vmap(place))(x)
+    return Film(model, seconds, np.asarray(position), np.asarray(rotation))
 
 
 def _normalize(system: System, backend: str) -> System:

@@ -61,6 +61,11 @@ class Simulator(gymnasium.Env):
         self._reward = reward
         self._simulations: dict[int, SawyerXYZEnv] = {}
 
+    @property
+    def simulation(self) -> SawyerXYZEnv:
+        """The package's environment of the current episode."""
+        return self._current
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:

@@ -1,0 +1,63 @@
+"""An episode as it is seen: the geometries of a MuJoCo model, moving."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+_HIDDEN = 3  # MuJoCo shows the groups of geometries before this one.
+_PLANE = 0  # mujoco.mjtGeom.mjGEOM_PLANE, without its import
+
+
+class Film(NamedTuple):
+    """What is seen of an episode, frame by frame.
+
+    Attributes:
+      model: `mujoco.MjModel`; shapes and colours are read from it, poses are not.
+      seconds: from one frame to the next.
+      position: `[frames, geoms, 3]` in metres.
+      rotation: `[frames, geoms, 3, 3]`, from a geometry's own axes to the world's.
+    """
+
+    model: Any
+    seconds: float
+    position: Array
+    rotation: Array
+
+
+def solids(film: Film) -> Array:
+    """Indices of the geometries that are shown and have an end, so no floors."""
+    model = film.model
+    shown = (model.geom_group < _HIDDEN) & (model.geom_rgba[:, 3] > 0)
+    return np.flatnonzero(shown & (model.geom_type != _PLANE))
+
+
+def movable(film: Film) -> Array:
+    """Those of the solids that belong to bodies with joints."""
+    model, some = film.model, solids(film)
+    return some[model.body_weldid[model.geom_bodyid[some]] > 0]
+
+
+def colour(film: Film, geom: int) -> Array:
+    """`[4]`, red, green, blue and opacity in [0, 1], by MuJoCo's rule."""
+    model = film.model
+    own, material = model.geom_rgba[geom], model.geom_matid[geom]
+    default = np.array_equal(own, np.float32([0.5, 0.5, 0.5, 1.0]))
+    return model.mat_rgba[material] if material >= 0 and default else own
+
+
+def gaze(film: Film) -> tuple[Array, float]:
+    """Where a camera looks, `[frames, 3]`, and how large is what it must show.
+
+    It follows what walks away, in the plane, and rests on what stays.
+    """
+    some = movable(film)
+    centre = film.position[:, some].mean(axis=1)
+    reach = np.linalg.norm(film.position[0, some] - centre[0], axis=1)
+    size = float((reach + film.model.geom_rbound[some]).max())
+    centre[:, 2] = centre[:, 2].mean()
+    if np.ptp(centre, axis=0).max() < size:
+        centre[:] = centre.mean(axis=0)
+    return centre, size
