@@ -12,13 +12,22 @@ from pathlib import Path
 from typing import Any
 
 from experiments import suite
-from experiments.faults import kills
+from experiments.faults import folders, kills, signals, surprises, versions
 from experiments.faults.base import Impossible, Kind
 from rewire_jax import runfolder
 from rewire_jax.config import require
 from rewire_jax.tables import markdown
 
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (*kills.KINDS,)}
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        *kills.KINDS,
+        *signals.KINDS,
+        *folders.KINDS,
+        *versions.KINDS,
+        *surprises.KINDS,
+    )
+}
 READING = (
     "Every case runs the command in a process of its own, on small runs. It is as it "
     "should be if it ends in one clear line without a traceback, or goes on to the "

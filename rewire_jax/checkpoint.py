@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.errors import UserError
+from rewire_jax.errors import REMEDY, UserError
+from rewire_jax.version import __version__
 
 _FORMAT = 1
 _MANIFEST = "manifest.json"
@@ -33,7 +34,11 @@ _KINDS = (np.bool_, np.number, jax.dtypes.prng_key)
 
 
 class CheckpointError(UserError):
-    """A checkpoint that is missing, damaged, or not what the caller expects."""
+    """A checkpoint that is missing or damaged."""
+
+
+class ForeignError(UserError):
+    """A checkpoint that is whole, but not what this version would have written."""
 
 
 def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:
@@ -50,6 +55,7 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
     """
     path = Path(path).absolute()  # Orbax refuses relative paths.
     content: dict[str, Any] = {
+        "version": __version__,
         "metadata": dict(metadata),
         "items": {name: [*_describe(name, tree)] for name, tree in items.items()},
     }
@@ -75,8 +81,8 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
         _sync(path.parent)
     except (OSError, ValueError) as error:  # TensorStore's are ValueErrors.
         raise UserError(
-            f"cannot write checkpoint {path}: {_reason(error)}; free space or make the "
-            "folder writable, then run again (earlier checkpoints are untouched)"
+            f"cannot write checkpoint {path}: {_reason(error)}; {REMEDY} (earlier "
+            "checkpoints are untouched)"
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -96,27 +102,26 @@ def load(
       The items with numpy arrays, wherever the saved ones lived, and the metadata.
 
     Raises:
-      CheckpointError: it is missing or damaged, or differs from `items_like`.
+      CheckpointError: it is missing or damaged.
+      ForeignError: it differs from `items_like`, or is of another format.
     """
     path = Path(path).absolute()
     content = _read_manifest(path)
-    for name, like in items_like.items():
-        stored = content["items"].get(name, ())
-        for have, want in itertools.zip_longest(stored, _describe(name, like)):
-            if have != want:
-                raise CheckpointError(
-                    f"checkpoint {path} holds {have or 'no leaf'} where "
-                    f"{want or 'no leaf'} is expected"
-                )
     try:
-        for file, fingerprint in content["files"].items():
-            wanted = file.partition("/")[0] in items_like
-            if wanted and _fingerprint(path / file) != fingerprint:
-                raise ValueError(f"{file} has other bytes than were written")
+        for name, like in items_like.items():
+            stored = content["items"].get(name, ())
+            for have, want in itertools.zip_longest(stored, _describe(name, like)):
+                if have != want:
+                    what = f"{have or 'no leaf'} where {want or 'no leaf'} is expected"
+                    raise _foreign(path, content, f"it holds {what}")
+            _verify(path, name, content["files"])
         items = {name: _read_item(path / name, x) for name, x in items_like.items()}
-    except (OSError, ValueError) as error:
+        return items, content["metadata"]
+    except ForeignError:
+        raise
+    # What is not its own makes Orbax fail in many ways.
+    except Exception as error:
         raise _unreadable(path, error) from error
-    return items, content["metadata"]
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
@@ -151,6 +156,25 @@ def _describe(item: str, tree: Any) -> Iterator[str]:
         yield f"{name} {dtype}[{','.join(map(str, leaf.shape))}]"
 
 
+def _verify(path: Path, item: str, files: Mapping[str, Any]) -> None:
+    """Raises `OSError` or `ValueError` unless an item's files are those written."""
+    root = path.resolve()
+    written = {name: x for name, x in files.items() if name.split("/")[0] == item}
+    for name, fingerprint in written.items():
+        file = path / name
+        # Neither a link to elsewhere, nor a device that has no end.
+        if file.resolve(strict=True) != root / name or not file.is_file():
+            raise ValueError(f"{name} is no file of its own")
+        same = file.stat().st_size == fingerprint[0]
+        if not same or _fingerprint(file) != fingerprint:
+            raise ValueError(f"{name} has other bytes than were written")
+    for file in (path / item).rglob("[!.]*"):
+        name = file.relative_to(path).as_posix()
+        # Orbax reads some files just because they are there.
+        if name not in written and not file.is_dir():
+            raise ValueError(f"{name} is foreign")
+
+
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
@@ -176,6 +200,7 @@ def _read_item(folder: Path, like: Any) -> Any:
             args = ocp.args.PyTreeRestore(
                 item=dict.fromkeys(names, 0), restore_args=dict.fromkeys(names, host)
             )
+            _check_sizes(orbax.metadata(folder).item_metadata, like)
             arrays = orbax.restore(folder, args=args)
     for i, leaf in enumerate(leaves):
         if 0 in leaf.shape:
@@ -186,6 +211,16 @@ def _read_item(folder: Path, like: Any) -> Any:
         else:
             leaves[i] = arrays[str(i)]
     return jax.tree.unflatten(structure, leaves)
+
+
+def _check_sizes(found: Any, like: Any) -> None:
+    """Raises `ValueError` unless stored arrays are as expected; reads none of them."""
+    for i, leaf in enumerate(jax.tree.leaves(like)):
+        if 0 not in leaf.shape:
+            want = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+            have = found[str(i)]
+            if (have.shape, have.dtype) != (want.shape, want.dtype):
+                raise ValueError(f"array {i} is {have.dtype}{list(have.shape)}")
 
 
 @contextmanager
@@ -213,23 +248,33 @@ def _orbax() -> Iterator[tuple[Any, Any]]:
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads((path / _MANIFEST).read_bytes())
+        file = path / _MANIFEST
+        if file.exists() and not file.is_file():
+            raise ValueError
+        manifest = json.loads(file.read_bytes())
         if manifest["format"] != _FORMAT:
-            other = ValueError(f"format {manifest['format']}, not {_FORMAT}")
-            raise _unreadable(path, other)
+            other = f"it has format {manifest['format']}, not {_FORMAT}"
+            raise _foreign(path, manifest["content"], other)
         if manifest["sha256"] != _digest(manifest["content"]):
             raise ValueError
     except OSError as error:
         raise _unreadable(path, error) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         damage = ValueError(f"{_MANIFEST} is damaged or foreign")
         raise _unreadable(path, damage) from error
     return manifest["content"]
 
 
 def _unreadable(path: Path, error: Exception) -> CheckpointError:
-    return CheckpointError(
-        f"cannot read checkpoint {path}: {_reason(error)}; use an earlier one"
+    return CheckpointError(f"cannot read checkpoint {path}: {_reason(error)}")
+
+
+def _foreign(path: Path, content: Any, why: str) -> ForeignError:
+    known = content if isinstance(content, dict) else {}
+    written = known.get("version", "of an unknown version")
+    return ForeignError(
+        f"checkpoint {path} does not fit rewire_jax {__version__}: {why}; it was "
+        f"written by rewire_jax {written}: use that, or start anew in another folder"
     )
 
 

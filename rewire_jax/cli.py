@@ -6,17 +6,23 @@ import dataclasses
 import io
 import itertools
 import json
+import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import tyro
+from rich.console import Console
 
 from rewire_jax import (
     continual,
     inspection,
+    interrupts,
     population,
     report,
     runfolder,
@@ -33,6 +39,7 @@ from rewire_jax.scores import Success
 from rewire_jax.version import __version__
 
 T = TypeVar("T")
+_INTERRUPTED = 130
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -156,20 +163,21 @@ def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) ->
 
     Raises:
       UserError: an argument is unknown, missing or no value of its kind; tyro says
-        so in a box, of which this is the first part, in one line.
+        so in a box, of which this is the first part, and the flags in the second.
     """
-    box = io.StringIO()
+    prog, box = f"rewire-jax {name}", io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(
-                kind, prog=f"rewire-jax {name}", args=list(arguments), **options
-            )
+            return tyro.cli(kind, prog=prog, args=list(arguments), **options)
     except SystemExit as exit_:
         if not exit_.code:
             raise
         lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
-        said = list(itertools.takewhile(lambda line: not line.startswith("─"), lines))
-        raise UserError(" ".join(" ".join(said).split())) from None
+        parts = itertools.groupby(lines, lambda line: line.startswith("─"))
+        said, hint, *_ = [" ".join(part) for rule, part in parts if not rule]
+        close = re.findall(r"--[a-z-]+", hint) if hint.startswith("Perhaps") else []
+        meant = f"; perhaps you meant {' or '.join(close)}" if close else ""
+        raise UserError(f"{' '.join(said.split())}{meant}; see {prog} --help") from None
 
 
 def _peek(arguments: Sequence[str], **defaults: str | None) -> list[Any]:
@@ -369,13 +377,58 @@ _USAGE = """usage: rewire-jax COMMAND ...
 
 `rewire-jax COMMAND --help` says more, `rewire-jax --version` which version this is.
 What is compiled is kept for later commands in ~/.cache/rewire_jax; `--cache DIR` with
-any command names another folder, and `--cache off` keeps nothing.
+any command names another folder, and `--cache off` keeps nothing. `--debug` with any
+command shows where an error comes from.
 """
 
 
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """A second Ctrl-C ends the process if it does not end by itself in a second."""
+    over = threading.Event()
+
+    def end(times: int) -> None:
+        if times == 2 and not over.wait(1.0):
+            # A live display has hidden the cursor.
+            Console(stderr=True).show_cursor()
+            print(
+                "stopped at once: what was saved stays; --resume goes on from there",
+                file=sys.stderr,
+                flush=True,
+            )
+            os._exit(_INTERRUPTED)
+
+    with interrupts.noticed(end):
+        try:
+            yield
+        finally:
+            over.set()
+
+
+def _ending(error: BaseException) -> tuple[str, int]:
+    """The line in which a command ends, and its exit status."""
+    if isinstance(error, UserError):
+        return f"error: {error}", 2
+    if isinstance(error, continual.Stopped):
+        return str(error), _INTERRUPTED
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted", _INTERRUPTED
+    said = f"{type(error).__name__}: {error}".partition("\n")[0]
+    return (
+        f"error: unexpected {said}; run again with --debug to see where, and please "
+        "report it",
+        1,
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs a command; exits with 2 on a user's error, 130 on an interruption."""
+    """Runs a command.
+
+    Exits with 2 on a user's error, 130 on an interruption, 1 on what is unexpected.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments
+    arguments = [word for word in arguments if word != "--debug"]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_USAGE, end="")
         sys.exit(0 if arguments else 2)
@@ -386,13 +439,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         known = ", ".join(_COMMANDS)
         require(name in _COMMANDS, f"unknown command {name!r}: choose one of {known}")
-        _COMMANDS[name](_keep(rest))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except continual.Stopped as stopped:
-        print(stopped, file=sys.stderr)
-        sys.exit(130)
+        with _stoppable():
+            _COMMANDS[name](_keep(rest))
+    except (Exception, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exc()
+        line, status = _ending(error)
+        print(line, file=sys.stderr)
+        sys.exit(status)
 
 
 if __name__ == "__main__":

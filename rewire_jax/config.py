@@ -1,6 +1,8 @@
 """Settings of a run: frozen dataclasses whose numbers may be traced."""
 
 import dataclasses
+import math
+import numbers
 import typing
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -172,8 +174,18 @@ _AT_LEAST: dict[str, float] = {
     "target_delay": 1,
     "noise_color": 0,
 }
+# Counters have 32 bits, as floats have; the others only keep loops from being endless.
+_LARGEST = 2**31
+_LARGEST_FLOAT = 3.4e38
+_AT_MOST = {"seeds": 65_536, "depth": 1_000}
 _POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
 _SHARE = ("discount", "target_rate")
+_KINDS: dict[Any, tuple[type, str]] = {
+    bool: (bool, "true or false"),
+    int: (numbers.Integral, "a whole number"),
+    float: (numbers.Real, "a number"),
+    str: (str, "a word"),
+}
 
 
 def require(condition: bool, message: str) -> None:
@@ -187,11 +199,35 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def check_kinds(group: Any) -> None:
+    """Raises `UserError` unless all of a dataclass's values are of their kinds."""
+    for name, kind in typing.get_type_hints(type(group)).items():
+        value = getattr(group, name)
+        told = f"not {value!r:.80}"
+        if typing.get_origin(kind) is Literal:
+            known = typing.get_args(kind)
+            choices = ", ".join(map(str, known))
+            require(value in known, f"{flag(name)} must be one of {choices}, {told}")
+        elif kind in _KINDS:
+            base, noun = _KINDS[kind]
+            # Python counts with truth values, too.
+            fits = isinstance(value, base) and isinstance(value, bool) == (kind is bool)
+            require(fits, f"{flag(name)} must be {noun}, {told}")
+            if kind is int:
+                most = _AT_MOST.get(name, _LARGEST - 1)
+                require(value <= most, f"{flag(name)} must be at most {most}, {told}")
+            if kind is float:
+                small = not math.isfinite(value) or abs(value) < _LARGEST_FLOAT
+                require(small, f"{flag(name)} is too large for a 32-bit float: {value}")
+
+
 def validate(run: Settings) -> None:
     """Raises `UserError` if a value of `run` or `run.sac` makes no sense.
 
-    A method's own options are checked by the method.
+    Of a method's own options only the kinds are checked here.
     """
+    for group in (run, run.sac, run.options):
+        check_kinds(group)
     values = vars(run) | vars(run.sac)
     for name, value in values.items():
         if isinstance(value, float):
@@ -228,14 +264,29 @@ def from_json(data: dict[str, Any], options: type) -> Settings:
     """The settings that `to_json` wrote; `options` is the method's settings class.
 
     Raises:
-      UserError: if a field is missing or unknown.
+      UserError: if a field is missing or unknown, or its value makes no sense.
     """
     try:
-        return Settings(
-            **data
-            | {"sac": SacSettings(**data["sac"]), "options": options(**data["options"])}
-        )
-    except (TypeError, KeyError) as error:
-        raise UserError(
-            f"the saved settings do not fit this version of rewire_jax: {error}"
-        ) from error
+        parts = {
+            "sac": _filled(SacSettings, data["sac"]),
+            "options": _filled(options, data["options"]),
+        }
+        run = _filled(Settings, data | parts)
+    except (TypeError, KeyError, AttributeError) as error:
+        raise UserError(f"its settings are damaged ({error})") from error
+    validate(run)
+    return run
+
+
+def _filled(cls: type[T], data: dict[str, Any]) -> T:
+    """A settings class with saved values, and the defaults of what came later."""
+    fields = {field.name: field.default for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    unknown = ", ".join(sorted(data.keys() - fields.keys()))
+    require(not unknown, f"it has the unknown setting {unknown}")
+    lacking = [
+        name
+        for name, default in fields.items()
+        if name not in data and default is dataclasses.MISSING
+    ]
+    require(not lacking, f"it has no setting {', '.join(lacking)}")
+    return cls(**data)

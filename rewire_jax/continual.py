@@ -2,6 +2,7 @@
 
 import functools
 import signal
+import threading
 import time as clock
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -14,6 +15,7 @@ import numpy as np
 
 from rewire_jax import (
     config,
+    interrupts,
     loggers,
     memory,
     population,
@@ -398,21 +400,33 @@ def _finite(value: float | None) -> float | None:
 
 @contextmanager
 def interruptible(run: Run) -> Iterator[None]:
-    """Ctrl-C once: stop after the running chunk and save. Twice: stop at once."""
+    """Ctrl-C once: stop after the running chunk and save. Twice: stop at once.
+
+    Raises:
+      Stopped: at once.
+    """
 
     def handle(number: int, frame: Any) -> None:
         if run.stopping:
             raise KeyboardInterrupt
         run.stopping = True
-        run.progress.message("stopping after this chunk; press Ctrl-C again to kill")
 
-    try:
-        previous = signal.signal(signal.SIGINT, handle)
-    except ValueError:  # not the main thread
+    def tell(times: int) -> None:
+        if times == 1:
+            run.progress.message("stopping after this chunk; Ctrl-C again: at once")
+
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
+    previous = signal.signal(signal.SIGINT, handle)
     try:
-        yield
+        with interrupts.noticed(tell):
+            yield
+    except KeyboardInterrupt:
+        raise Stopped(
+            "stopped at once: continue from the newest checkpoint with --resume --out "
+            f"{run.folder}"
+        ) from None
     finally:
         signal.signal(signal.SIGINT, previous)
 
@@ -446,19 +460,19 @@ def train(
     folder = Path(out)
     loggers.check(log)
     plan = prepare(settings, scenario)
-    if resume:
-        runfolder.compare(folder, plan.settings)
-    else:
-        header = {
-            "settings": config.to_json(plan.settings),
-            "tasks": plan.names,
-            "spec": plan.spec._asdict(),
-            "episode_length": plan.scenario.environment.episode_length,
-            "provenance": runfolder.provenance(),
-        }
-        runfolder.create(folder, header)
+    memory.check(plan)
+    header = {
+        "settings": config.to_json(plan.settings),
+        "tasks": plan.names,
+        "spec": plan.spec._asdict(),
+        "episode_length": plan.scenario.environment.episode_length,
+        "provenance": runfolder.provenance(),
+    }
     label = f"{settings.method} on {settings.scenario}"
     with ExitStack() as stack:
+        stack.enter_context(runfolder.held(folder, None if resume else header))
+        if resume:
+            runfolder.compare(folder, plan.settings)
         display = stack.enter_context(
             progress(plan.names, plan.interactions, [m.name for m in plan.crowd], label)
         )

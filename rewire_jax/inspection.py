@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax import checkpoint, config, rollout, runfolder, standing
+from rewire_jax import config, rollout, runfolder, standing
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection, Spec
-from rewire_jax.plan import base_size, make_spec, prepare
+from rewire_jax.plan import base_size, make_spec, prepare, saved
 from rewire_jax.presets import preset
 from rewire_jax.scenarios import Scenario
 
@@ -103,13 +103,11 @@ def evaluate(
         f"{folder} holds a sweep: `rewire-jax report {folder}` shows its evaluations, "
         "load_policy gives the policy of a member",
     )
-    header = runfolder.read_header(folder)
-    entry = find_method(header["settings"]["method"])
-    plan = prepare(config.from_json(header["settings"], entry.settings))
+    _, settings = saved(folder)
+    plan = prepare(settings)
     learner = jax.eval_shape(plan.program.init, plan.members)
-    like = {"policy": (learner.params, learner.memory)}
-    items, _ = checkpoint.load(standing.kept(folder, stage), like)
-    params, memory = items["policy"]
+    like = learner.params, learner.memory
+    params, memory = standing.read_policies(folder, stage, like)
     learner = plan.program.init(plan.members)._replace(params=params, memory=memory)
     policies = plan.program.policies(plan.members, learner)
     keys = jax.random.split(jax.random.key(seed), (plan.places, len(plan.names)))

@@ -1,7 +1,8 @@
-"""Reads tables of JSON lines, the last of which a crash may have cut."""
+"""Reads JSON: documents, and tables of lines, the last of which may have been cut."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,6 +11,17 @@ import numpy as np
 from rewire_jax.errors import UserError
 
 T = TypeVar("T")
+
+# Raised on JSON that is not what was written here.
+_DAMAGE = (
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
 
 
 def table(
@@ -22,8 +34,7 @@ def table(
 
     Args:
         path: the file.
-        parse: from a row to its key and value; `ValueError`, `TypeError` and
-            `KeyError` say that the row is damaged.
+        parse: from a row to its key and value; it may fail as in `reading`.
         needed: otherwise a missing file is an empty table.
 
     Raises:
@@ -35,18 +46,33 @@ def table(
     rows = {}
     # What follows the last line break is empty, or a line that was cut.
     for place, line in enumerate(lines[:-1], 1):
-        try:
+        with reading(f"{path}, line {place}"):
             key, value = parse(json.loads(line))
-        except (ValueError, TypeError, KeyError) as error:
-            why = reason(error)
-            raise UserError(f"{path}, line {place} is damaged ({why})") from None
-        rows[key] = value
+            rows[key] = value
     return rows
+
+
+def document(path: Path) -> Any:
+    """What a JSON file holds; `UserError` if it cannot be read, or is damaged."""
+    with reading(path):
+        return json.loads(text(path))
+
+
+@contextmanager
+def reading(what: Path | str) -> Iterator[None]:
+    """What fails inside because values are missing or odd is a `UserError`."""
+    try:
+        yield
+    except _DAMAGE as error:
+        why = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise UserError(f"{what} is damaged ({why[:200]})") from None
 
 
 def text(path: Path) -> str:
     """What a file holds; `UserError` if it cannot be read."""
     try:
+        if path.exists() and not path.is_file():
+            raise UserError(f"cannot read {path}: not a file")
         # A crash may cut inside a character; JSON then refuses the line as it should.
         return path.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
@@ -66,8 +92,3 @@ def index(row: dict[str, Any], name: str, low: int, high: int) -> int:
 def number(value: float | None) -> float:
     """A number of JSON, whose null stands for NaN."""
     return np.nan if value is None else float(value)
-
-
-def reason(error: Exception) -> str:
-    """Why a row is damaged, in a few words."""
-    return f"no {error}" if isinstance(error, KeyError) else str(error)

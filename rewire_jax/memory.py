@@ -22,6 +22,7 @@ from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
 from rewire_jax import noise, rollout, training
 from rewire_jax.config import require
 from rewire_jax.envs.base import HostEnvironment
+from rewire_jax.errors import UserError
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import map_own
 from rewire_jax.plan import Plan
@@ -62,14 +63,30 @@ class Need(NamedTuple):
         return f"a member needs {self.total / 1e6:.3g} MB: {parts}"
 
 
+def _held(plan: Plan) -> tuple[Any, Any]:
+    """Shapes of a learner between tasks, and of all that is held within one."""
+    task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+    fresh = jax.eval_shape(plan.program.init, plan.members)
+    alive = jax.ShapeDtypeStruct((plan.places,), bool)
+    return fresh, plan.program.expect(plan.members, fresh, alive, 0, task)
+
+
+def check(plan: Plan) -> None:
+    """Raises `UserError` if what is held in training alone is more than there is."""
+    held = size(_held(plan)[1])
+    room = _total(list(plan.mesh.devices.flat))
+    require(
+        room is None or held <= room,
+        f"a run of this size holds {held / 1e9:.3g} GB, and there are "
+        f"{(room or 0) / 1e9:.3g}: lower --seeds, --buffer, --envs or --hidden",
+    )
+
+
 def need(plan: Plan) -> Need:
     """Counts what each member of a plan needs; traces, but compiles nothing."""
     program, settings, spec = plan.program, plan.settings, plan.spec
     environment, make = plan.scenario.environment, find_method(settings.method).make
-    task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-    fresh = jax.eval_shape(program.init, plan.members)
-    alive = jax.ShapeDtypeStruct((plan.places,), bool)
-    state = program.expect(plan.members, fresh, alive, 0, task)
+    fresh, state = _held(plan)
 
     def learn(member, state):
         return training.learn(
@@ -182,16 +199,23 @@ def device_bytes(devices: Sequence[jax.Device]) -> int:
     Raises:
       UserError: a device does not tell.
     """
+    total = _total(devices)
+    if total is None:
+        raise UserError(
+            f"{devices[0].device_kind} does not tell its memory: give "
+            "--members-per-batch"
+        )
+    return int(_SHARE * total)
+
+
+def _total(devices: Sequence[jax.Device]) -> int | None:
+    """Bytes of these devices together; None if one does not tell."""
     if devices[0].platform == "cpu":
         # All CPU devices are one machine.
-        return int(_SHARE * machine_bytes())
+        return machine_bytes()
     limits = [(device.memory_stats() or {}).get("bytes_limit") for device in devices]
     known = [limit for limit in limits if limit]
-    require(
-        len(known) == len(limits),
-        f"{devices[0].device_kind} does not tell its memory: give --members-per-batch",
-    )
-    return int(_SHARE * sum(known))
+    return sum(known) if len(known) == len(limits) else None
 
 
 def most_held() -> dict[str, int]:

@@ -2,13 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from rewire_jax import config, networks, population, program, training
+from rewire_jax import config, networks, population, program, runfolder, training
 from rewire_jax.config import Settings, require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods import find_method
@@ -99,10 +100,21 @@ def prepare(
     """
     config.validate(settings)
     entry = find_method(settings.method)
+    require(
+        isinstance(settings.options, entry.settings),
+        f"--method {settings.method} takes {entry.settings.__name__} as options, not "
+        f"{type(settings.options).__name__}",
+    )
     settings = dataclasses.replace(settings, options=settings.options.checked())
     scenario = scenario or make_scenario(
         settings.scenario, settings.backend, settings.reward
     )
+    for name in ("scenario", "backend"):
+        made = {"scenario": scenario.name, "backend": scenario.backend}[name]
+        given = getattr(settings, name)
+        require(
+            given == made, f"{config.flag(name)} {given}: the run is on {made}; drop it"
+        )
     require(
         settings.tasks <= len(scenario.tasks),
         f"--tasks {settings.tasks}: {scenario.name} has {len(scenario.tasks)}",
@@ -178,3 +190,16 @@ def _selection(
     # Some rows for nothing, where that lets an evaluation's compiled function serve.
     same = settings.selection_episodes == settings.eval_episodes
     return number, max(number, settings.tasks) if same and not hosted else number
+
+
+def saved(folder: Path, kind: str = "run") -> tuple[dict[str, Any], Settings]:
+    """The header of a run or sweep, and the settings in it.
+
+    Raises:
+      UserError: there is none; or it is not as this version writes it, which says
+        what version did.
+    """
+    header = runfolder.read_header(folder, kind)
+    entry = find_method(header["settings"]["method"])
+    with runfolder.telling_version(folder, header):
+        return header, config.from_json(header["settings"], entry.settings)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -13,6 +14,7 @@ from rewire_jax.config import SacSettings
 from rewire_jax.errors import UserError
 
 _AXIS = "members"
+_LONGEST = 1_000  # bytes that processes tell each other
 
 
 class Member(NamedTuple):
@@ -96,6 +98,27 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
             f"--coordinator {coordinator}: {said} Check the address, --processes and "
             "--process."
         ) from error
+
+
+def at_first(step: Callable[[], Any]) -> None:
+    """Has the first process make a step that comes before all others.
+
+    Raises:
+      UserError: the step's; in every process, which so end alike.
+    """
+    if jax.process_count() == 1:
+        step()
+        return
+    said = b""
+    if jax.process_index() == 0:
+        try:
+            step()
+        except UserError as error:
+            said = str(error).encode()[:_LONGEST]
+    sent = np.frombuffer(said.ljust(_LONGEST, b"\0"), np.uint8)
+    heard = np.asarray(multihost_utils.broadcast_one_to_all(sent), np.uint8)
+    if text := bytes(heard).rstrip(b"\0"):
+        raise UserError(text.decode(errors="replace"))
 
 
 def mesh(members: int) -> Mesh:

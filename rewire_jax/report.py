@@ -15,7 +15,7 @@ from rich.text import Text
 
 from rewire_jax import tables
 from rewire_jax.config import require
-from rewire_jax.errors import UserError
+from rewire_jax.errors import writing
 from rewire_jax.rundata import RunData, read_run
 from rewire_jax.scenarios import SCENARIOS
 from rewire_jax.scores import SUCCESS, Success
@@ -128,15 +128,13 @@ def write_report(
         matrix=out / "matrix.png",
         tradeoff=out / "tradeoff.png",
     )
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         report.markdown.write_text(_markdown(report), encoding="utf-8")
         report.csv.write_text(tables.results_csv(comparison), encoding="utf-8")
         report.tasks.write_text(tables.tasks_csv(comparison), encoding="utf-8")
         report.json.write_text(_json(report), encoding="utf-8")
         _draw(report)
-    except OSError as error:
-        raise UserError(f"cannot write {error.filename}: {error.strerror}") from None
     return report
 
 

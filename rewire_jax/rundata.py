@@ -1,6 +1,5 @@
 """Reads the result files of a run folder, finished or not, into arrays."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -8,12 +7,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rewire_jax import runfolder
 from rewire_jax.errors import UserError
-from rewire_jax.jsonlines import index, number, reason, table, text
+from rewire_jax.jsonlines import document, index, number, reading, table
 from rewire_jax.scores import RETURN, SCORES, SUCCESS, Score, Success
 
 Array = NDArray[np.float64]
-_NEEDED = ("scenario", "method", "profile", "backend", "interactions")
+_NEEDED = {
+    "scenario": str,
+    "method": str,
+    "profile": str,
+    "backend": str,
+    "interactions": int,
+}
 
 
 class Head(NamedTuple):
@@ -175,8 +181,11 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
 
 def read_head(path: Path) -> Head:
     """The header of a run or a sweep; `UserError` if it is missing or damaged."""
-    try:
-        whole = json.loads(text(path))
+    whole = document(path)
+    runfolder.check_format(path.parent, whole)
+    with runfolder.telling_version(path.parent, whole), reading(path):
+        if not isinstance(whole["tasks"], list):
+            raise ValueError("tasks are no list")
         head = Head(
             settings=dict(whole["settings"]),
             tasks=tuple(str(name) for name in whole["tasks"]),
@@ -184,9 +193,8 @@ def read_head(path: Path) -> Head:
             episode_length=int(whole["episode_length"]),
             whole=whole,
         )
-    except (ValueError, TypeError, KeyError) as error:
-        raise UserError(f"{path} is damaged ({reason(error)})") from None
-    missing = [name for name in _NEEDED if name not in head.settings]
+    of = head.settings.get
+    missing = [name for name, kind in _NEEDED.items() if not isinstance(of(name), kind)]
     if missing or not head.tasks:
         raise UserError(f"{path} lacks {', '.join(missing) or 'tasks'}")
     return head

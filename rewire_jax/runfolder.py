@@ -5,15 +5,18 @@ results.jsonl     a row for each evaluation: stage, task, seed
 training.jsonl    a row for each progress report and seed
 timing.jsonl      a row for each progress report: wall-clock seconds
 checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
+.lock             is locked by the process that trains
 """
 
 import contextlib
+import fcntl
+import hashlib
 import importlib.metadata
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,12 +24,16 @@ from typing import Any
 import jax
 
 from rewire_jax import config
-from rewire_jax.errors import UserError
+from rewire_jax.errors import UserError, writing
+from rewire_jax.jsonlines import document, reading
 from rewire_jax.version import __version__
 
 FORMAT = 1
 HEADER = "settings.json"
 TABLES = ("results.jsonl", "training.jsonl", "timing.jsonl")
+_LOCK = ".lock"
+Mark = Sequence[Any] | int
+"""Length of a table in bytes, and their SHA-256; older versions noted the length."""
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "mujoco", "orbax-checkpoint")
 
 
@@ -55,41 +62,76 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def create(folder: Path, header: Mapping[str, Any]) -> None:
-    """Makes a run folder.
+@contextlib.contextmanager
+def held(
+    folder: Path, header: Mapping[str, Any] | None, kind: str = "run"
+) -> Iterator[None]:
+    """Keeps the folder of a run from all other processes as long as this lasts.
+
+    Args:
+      folder: of the run or sweep.
+      header: of a new one; None to go on with the one that is there.
+      kind: of the one that is there.
 
     Raises:
-      UserError: the folder holds something, or cannot be written.
+      UserError: the folder holds something else, or cannot be written, or another
+        process trains in it.
     """
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            what = "another run" if (folder / HEADER).exists() else "something else"
+    if header is None:
+        read_header(folder, kind)
+    else:
+        _check_vacant(folder)
+        make(folder)
+    with writing(folder):
+        lock = (folder / _LOCK).open("a")
+    with lock:
+        try:
+            # The system lets go of it when the process ends, however that is.
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             raise UserError(
-                f"{folder} holds {what}: name another folder with --out, or continue "
-                "the run there with --resume"
-            )
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error}") from error
-    make(folder)
-    write(folder / HEADER, {"format": FORMAT, **header})
+                f"another process trains in {folder}: wait for its end or stop it, "
+                "then go on with --resume; or name another folder with --out"
+            ) from None
+        except OSError:  # a file system without locks
+            pass
+        if header is not None:
+            _check_vacant(folder)  # Another process may have been faster.
+            write(folder / HEADER, {"format": FORMAT, **header})
+        yield
+
+
+def _check_vacant(folder: Path) -> None:
+    """Raises `UserError` if a folder holds more than a start that was cut short."""
+    with writing(folder):
+        others = folder.exists() and (
+            not folder.is_dir()
+            or {path.name for path in folder.iterdir()} - {_LOCK, f".{HEADER}"}
+        )
+    if others:
+        what = "another run" if (folder / HEADER).exists() else "something else"
+        raise UserError(
+            f"{folder} holds {what}: name another folder with --out, or continue "
+            "the run there with --resume"
+        )
 
 
 def make(folder: Path) -> None:
     """Makes a folder that may be there; `UserError` if it cannot be made."""
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
     """Writes JSON, all of it or nothing; `UserError` if it cannot be written."""
+    temporary = path.with_name(f".{path.name}")
     try:
-        temporary = path.with_name(f".{path.name}")
-        temporary.write_text(json.dumps(content, indent=1) + "\n")
-        temporary.rename(path)
-    except OSError as error:
-        raise UserError(f"cannot write to {path.parent}: {error}") from error
+        with writing(path):
+            temporary.write_text(json.dumps(content, indent=1) + "\n")
+            temporary.rename(path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
@@ -98,25 +140,48 @@ def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
     Raises:
       UserError: there is none, one of another format, or of the other kind.
     """
-    try:
-        header = json.loads((folder / HEADER).read_text())
-    except OSError as error:
-        raise UserError(f"{folder} holds no {kind}: {HEADER} cannot be read") from error
-    except ValueError as error:
-        raise UserError(f"{folder / HEADER} is damaged: {error}") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise UserError(f"{folder} was not written by this version of rewire_jax")
+    if not (folder / HEADER).exists():
+        raise UserError(f"{folder} holds no {kind}: there is no {HEADER}")
+    header = document(folder / HEADER)
+    check_format(folder, header)
     found = header.get("kind", "run")
     if found != kind:
         raise UserError(f"{folder} holds a {found}, not a {kind}")
+    with reading(folder / HEADER):
+        header["settings"]["method"]
     return header
+
+
+def check_format(folder: Path, header: Any) -> None:
+    """Raises `UserError` if a folder's header is of another format."""
+    found = header.get("format") if isinstance(header, dict) else None
+    if found != FORMAT:
+        with telling_version(folder, header):
+            raise UserError(f"it has format {found}, not {FORMAT}")
+
+
+@contextlib.contextmanager
+def telling_version(folder: Path, header: Any) -> Iterator[None]:
+    """A `UserError` inside also says which version wrote a folder, by its header."""
+    try:
+        yield
+    except UserError as error:
+        try:
+            how = header["provenance"]
+            written = f"{how['versions']['rewire_jax']}, commit {how['commit']}"
+        except (KeyError, TypeError):
+            written = "of an unknown version"
+        raise UserError(
+            f"{folder} does not fit rewire_jax {__version__}: {error}; it was written "
+            f"by rewire_jax {written}: use that, or start anew in another folder"
+        ) from error
 
 
 def kind(folder: Path) -> str:
     """What a folder holds: "run", also where that cannot be told, or "sweep"."""
     try:
-        return json.loads((folder / HEADER).read_text()).get("kind", "run")
-    except (OSError, ValueError, AttributeError):
+        return document(folder / HEADER).get("kind", "run")
+    except (UserError, AttributeError):
         return "run"
 
 
@@ -129,10 +194,12 @@ def compare(folder: Path, settings: config.Settings, kind: str = "run") -> None:
             rows |= flat(value) if isinstance(value, dict) else {name: value}
         return rows
 
-    saved = read_header(folder, kind)["settings"]
+    header = read_header(folder, kind)
+    saved = header["settings"]
     if saved.get("method") == settings.method:
         # What the run's version did not have was as it is by default.
-        saved = config.to_json(config.from_json(saved, type(settings.options)))
+        with telling_version(folder, header):
+            saved = config.to_json(config.from_json(saved, type(settings.options)))
     then = flat(saved)
     now = flat(config.to_json(settings))
     changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
@@ -147,30 +214,53 @@ def compare(folder: Path, settings: config.Settings, kind: str = "run") -> None:
 def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Adds rows to a table; `UserError` if they cannot be written."""
     text = "".join(json.dumps(row) + "\n" for row in rows)
-    try:
-        with (folder / table).open("a") as file:
-            file.write(text)
-    except OSError as error:
-        raise UserError(f"cannot write to {folder / table}: {error}") from error
+    with writing(folder / table), (folder / table).open("a") as file:
+        file.write(text)
 
 
-def lengths(folder: Path) -> dict[str, int]:
-    """Bytes in each table, to come back to with `cut`."""
-    paths = {table: folder / table for table in TABLES}
-    return {t: path.stat().st_size if path.exists() else 0 for t, path in paths.items()}
+def marks(folder: Path) -> dict[str, Mark]:
+    """Where each table ends, to come back to with `cut`."""
+    found = {}
+    for table in TABLES:
+        held = _bytes(folder / table)
+        found[table] = len(held), _digest(held)
+    return found
 
 
-def cut(folder: Path, lengths: Mapping[str, int]) -> None:
-    """Forgets what was written after `lengths` was taken.
+def changed(folder: Path, marks: Mapping[str, Mark]) -> Path | None:
+    """A table that does not begin as it was when `marks` were taken, None if all do."""
+    for table, mark in marks.items():
+        length, digest = _parts(mark)
+        held = _bytes(folder / table)[:length]
+        if len(held) < length or (digest and _digest(held) != digest):
+            return folder / table
+    return None
+
+
+def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
+    """Forgets what was written after `marks` were taken; of other tables everything.
 
     Raises:
-      UserError: a table has lost rows since then.
+      UserError: a table cannot be written.
     """
-    for table, length in lengths.items():
+    for table in TABLES:
         path = folder / table
-        have = path.stat().st_size if path.exists() else 0
-        if have < length:
-            raise UserError(f"{path} has lost rows: restore it or start a new run")
-        if have > length:
-            with path.open("r+b") as file:
-                file.truncate(length)
+        length, _ = _parts(marks.get(table, 0))
+        with writing(path):
+            if path.exists() and path.stat().st_size > length:
+                os.truncate(path, length)
+
+
+def _parts(mark: Mark) -> tuple[int, str]:
+    return (mark, "") if isinstance(mark, int) else (mark[0], mark[1])
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes() if path.exists() else b""
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _digest(held: bytes) -> str:
+    return hashlib.sha256(held).hexdigest()

@@ -15,6 +15,7 @@ import numpy as np
 
 from rewire_jax import checkpoint, population, runfolder
 from rewire_jax.errors import UserError
+from rewire_jax.jsonlines import reading
 from rewire_jax.plan import Plan
 from rewire_jax.sac import Learner
 from rewire_jax.training import State
@@ -68,11 +69,10 @@ def save(folder: Path, standing: Standing) -> None:
     items: dict[str, Any] = {
         "counts": {"alive": standing.alive, "selection": standing.selection}
     }
-    name = _name(standing.stage)
+    name = _name(standing.stage, standing.steps)
     if standing.learner is not None:
         items |= _kept(standing.learner)
     else:
-        name += f"-step-{standing.steps:07d}"
         items |= {"state": standing.state}
         if standing.before is not None:
             items["before"] = standing.before
@@ -80,7 +80,7 @@ def save(folder: Path, standing: Standing) -> None:
         "stage": standing.stage,
         "steps": standing.steps,
         "items": sorted(items),
-        "tables": runfolder.lengths(folder),
+        "tables": runfolder.marks(folder),
     }
     checkpoint.save(folder / _FOLDER / name, items, metadata)
     checkpoints = checkpoint.available(folder / _FOLDER)
@@ -111,7 +111,7 @@ def finished(folder: Path, stage: int) -> bool:
 
 
 def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | None:
-    """The newest standing whose checkpoint is whole, None if there is none.
+    """The newest standing whose checkpoint and rows are whole, None if there is none.
 
     What the run's tables hold beyond it is cut off.
 
@@ -122,21 +122,28 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | 
     """
     for path in checkpoint.available(folder / _FOLDER):
         try:
-            standing, tables = _load(path, plan)
+            standing, marks = _load(path, plan)
         except checkpoint.CheckpointError as error:
             say(f"{error}; falling back to the one before")
             continue
-        runfolder.cut(folder, tables)
-        return standing
-    runfolder.cut(folder, dict.fromkeys(runfolder.TABLES, 0))
+        changed = runfolder.changed(folder, marks)
+        if not changed:
+            runfolder.cut(folder, marks)
+            return standing
+        say(
+            f"{changed} has lost or foreign rows; falling back to the checkpoint "
+            f"before {path.name}"
+        )
+    runfolder.cut(folder, {})
     return None
 
 
-def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, int]]:
+def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, runfolder.Mark]]:
     program, members = plan.program, plan.members
     learner = jax.eval_shape(program.init, members)
     like: dict[str, Any] = {"counts": _counts(plan)}
-    saved = checkpoint.read_metadata(path)["items"]
+    metadata = _facts(path)
+    saved = metadata["items"]
     if "state" in saved:
         task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
         like["state"] = program.expect(
@@ -147,7 +154,7 @@ def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, int]]:
     if "before" in saved and program.candidates is not None:
         candidates = jax.eval_shape(program.candidates, members, learner, 0)
         like["before"] = jax.ShapeDtypeStruct(candidates.valid.shape, jnp.float32)
-    items, metadata = checkpoint.load(path, like)
+    items, _ = checkpoint.load(path, like)
     if "policy" in items:
         return between(metadata["stage"], items, plan), metadata["tables"]
     items = population.place(items, plan.mesh)
@@ -170,7 +177,49 @@ def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
     """
     learner = jax.eval_shape(plan.program.init, plan.members)
     like = {"counts": _counts(plan)} | _kept(learner)
-    return checkpoint.load(folder / _FOLDER / _name(stage + 1), like)[0]
+    path = folder / _FOLDER / _name(stage + 1)
+    _facts(path)
+    return checkpoint.load(path, like)[0]
+
+
+def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
+    """The policies kept after a stage, or after the latest one.
+
+    Args:
+      folder: of the run.
+      stage: of its sequence, or None.
+      like: params and memory, `[members]`, as shapes.
+
+    Returns:
+      The same, on the host.
+
+    Raises:
+      UserError: there are none, or they are damaged.
+    """
+    path = kept(folder, stage)
+    try:
+        _facts(path)
+        return checkpoint.load(path, {"policy": like})[0]["policy"]
+    except checkpoint.CheckpointError as error:
+        raise checkpoint.CheckpointError(
+            f"{error}; delete it and what is newer beside it, and --resume trains "
+            "that again"
+        ) from error
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    """What a checkpoint says of itself.
+
+    Raises:
+      CheckpointError: it is not that of a run, or it is another than its name says.
+    """
+    facts = checkpoint.read_metadata(path)
+    with reading(path):
+        name = _name(facts["stage"], facts["steps"])
+        list(facts["items"]), dict(facts["tables"])
+    if path.name != name:
+        raise checkpoint.CheckpointError(f"checkpoint {path} was written as {name}")
+    return facts
 
 
 def between(stage: int, items: dict[str, Any], plan: Plan) -> Standing:
@@ -202,5 +251,5 @@ def _kept(learner: Learner) -> dict[str, Any]:
     return {"policy": (learner.params, learner.memory), "critic": learner.critic}
 
 
-def _name(tasks: int) -> str:
-    return f"task-{tasks:03d}"
+def _name(tasks: int, steps: int = 0) -> str:
+    return f"task-{tasks:03d}" + (f"-step-{steps:07d}" if steps else "")

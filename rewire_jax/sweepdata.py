@@ -1,6 +1,5 @@
 """Reads the result files of a sweep's folder, finished or not, into arrays."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.errors import UserError
-from rewire_jax.jsonlines import index, number, reason, table, text
+from rewire_jax.jsonlines import document, index, number, reading, table
 from rewire_jax.rundata import Head, read_head, result, times
 
 Array = NDArray[np.float64]
@@ -160,7 +159,7 @@ def _design(path: Path, head: Head) -> tuple[int, int, dict[str, Array], Whole, 
     """What a header says of the members, see `SweepData`."""
     if head.whole.get("kind") != "sweep":
         raise UserError(f"{path.parent} is not the folder of a sweep: it holds a run")
-    try:
+    with reading(path):
         members = list(head.whole["members"])
         axes = {
             name: np.array([member["values"][name] for member in members], np.float64)
@@ -173,8 +172,6 @@ def _design(path: Path, head: Head) -> tuple[int, int, dict[str, Array], Whole, 
         if [member["member"] for member in members] != list(range(len(members))):
             raise ValueError("members are not in order")
         drawn, halving = int(head.whole["random"]), int(head.whole["halving"])
-    except (ValueError, TypeError, KeyError, IndexError) as error:
-        raise UserError(f"{path} is damaged ({reason(error)})") from None
     return drawn, halving, axes, configurations, seeds
 
 
@@ -188,6 +185,17 @@ def batch(folder: Path, stage: int, number: int) -> Path:
     return batches_of(folder, stage).with_name(f"batch-{number:03d}")
 
 
+def read_batches(path: Path) -> tuple[list[list[int]], int]:
+    """The members of each batch, and the places in it; from `batches_of`.
+
+    Raises:
+      UserError: the file is missing or damaged.
+    """
+    read = document(path)
+    with reading(path):
+        return [[int(m) for m in b] for b in read["batches"]], int(read["size"])
+
+
 def _batches(
     folder: Path, count: int, tasks: int
 ) -> Iterator[tuple[int, Path, list[int]]]:
@@ -196,12 +204,9 @@ def _batches(
         path = batches_of(folder, stage)
         if not path.exists():
             return
-        try:
-            batches = [[int(m) for m in b] for b in json.loads(text(path))["batches"]]
-            known = all(0 <= member < count for batch in batches for member in batch)
-            if not known:
+        batches, _ = read_batches(path)
+        with reading(path):
+            if not all(0 <= member < count for batch in batches for member in batch):
                 raise ValueError(f"members are 0 to {count - 1}")
-        except (ValueError, TypeError, KeyError) as error:
-            raise UserError(f"{path} is damaged ({reason(error)})") from None
         for place, members in enumerate(batches):
             yield stage, batch(folder, stage, place), members

@@ -11,7 +11,6 @@ Talwalkar 2016).
 """
 
 import functools
-import json
 import math
 import sys
 import time
@@ -47,7 +46,7 @@ from rewire_jax.progress import Progress
 from rewire_jax.ranking import rank
 from rewire_jax.scenarios import Scenario, make_scenario
 from rewire_jax.standing import Standing
-from rewire_jax.sweepdata import batch, batches_of, read_sweep
+from rewire_jax.sweepdata import batch, batches_of, read_batches, read_sweep
 
 _POLL = 1.0  # seconds
 
@@ -108,8 +107,7 @@ class Sweep:
             runfolder.make(path.parent)
             runfolder.write(path, {"size": size, "batches": batches})
         _wait(path.exists)
-        read = json.loads(path.read_text())
-        return read["batches"], read["size"]
+        return read_batches(path)
 
     def survivors(self, stage: int) -> list[int]:
         """The members that are to be trained on a task."""
@@ -211,7 +209,7 @@ class Sweep:
                 items = standing.read_kept(folder, stage - 1, made)
             except checkpoint.CheckpointError as error:
                 raise UserError(
-                    f"{error}; or delete {folder} and resume to train it anew"
+                    f"{error}; delete {folder} and resume to train it anew"
                 ) from error
             for place, name in enumerate(numbers):
                 found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
@@ -298,32 +296,32 @@ def sweep(
         "episode_length": scenario.environment.episode_length,
         "provenance": runfolder.provenance(),
     }
-    if not resume and jax.process_index() == 0:
-        runfolder.create(folder, header)
-    elif not resume:
+    own = runfolder.held(folder, None if resume else header, "sweep")
+    with ExitStack() as stack:
+        population.at_first(lambda: stack.enter_context(own))
         _wait((folder / runfolder.HEADER).exists)
-    runfolder.compare(folder, plan.settings, "sweep")
-    saved = runfolder.read_header(folder, "sweep")
-    require(
-        saved["members"] == members and saved["halving"] == halving,
-        f"{folder} was started with other axes, seeds or halving: give the same again "
-        "or name another --out",
-    )
-    need = memory.need(plan)
-    made = Sweep(
-        folder=folder,
-        settings=plan.settings,
-        scenario=scenario,
-        crowd=crowd,
-        axes=tuple(configurations[0]),
-        halving=halving,
-        most=members_per_batch or memory.fitting(need, jax.local_devices()),
-        log=tuple(log),
-        progress=progress,
-    )
-    size, _ = made.share(len(crowd))
-    print(f"{need}; {len(crowd)} members, {size} at a time", file=sys.stderr)
-    made.run()
+        runfolder.compare(folder, plan.settings, "sweep")
+        saved = runfolder.read_header(folder, "sweep")
+        require(
+            saved["members"] == members and saved["halving"] == halving,
+            f"{folder} was started with other axes, seeds or halving: give the same "
+            "again or name another --out",
+        )
+        need = memory.need(plan)
+        made = Sweep(
+            folder=folder,
+            settings=plan.settings,
+            scenario=scenario,
+            crowd=crowd,
+            axes=tuple(configurations[0]),
+            halving=halving,
+            most=members_per_batch or memory.fitting(need, jax.local_devices()),
+            log=tuple(log),
+            progress=progress,
+        )
+        size, _ = made.share(len(crowd))
+        print(f"{need}; {len(crowd)} members, {size} at a time", file=sys.stderr)
+        made.run()
     return folder
 
 
@@ -361,14 +359,14 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
     Raises:
       UserError: it has not been trained so far.
     """
-    stages = sorted(int(path.name[-3:]) for path in folder.glob("task-*"))
-    for each in reversed(stages) if stage is None else [stage]:
-        path = batches_of(folder, each)
-        read = json.loads(path.read_text()) if path.exists() else {"batches": []}
-        for number, members in enumerate(read["batches"]):
+    begun = folder.glob("task-[0-9][0-9][0-9]/batches.json")
+    stages = sorted(int(path.parent.name[-3:]) for path in begun)
+    for each in reversed(stages) if stage is None else {stage}.intersection(stages):
+        batches, places = read_batches(batches_of(folder, each))
+        for number, members in enumerate(batches):
             inside = batch(folder, each, number)
             if member in members and standing.finished(inside, each):
-                return Found(inside, each, members.index(member), read["size"])
+                return Found(inside, each, members.index(member), places)
     when = "any task" if stage is None else f"task {stage}"
     raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rewire_jax import sweeptables, tables
-from rewire_jax.errors import UserError
+from rewire_jax.errors import writing
 from rewire_jax.report import heading
 from rewire_jax.sweepdata import read_sweep
 from rewire_jax.sweepsummary import Configuration, Panel, SweepSummary, summarize_sweep
@@ -84,7 +84,7 @@ def write_sweep_report(
         json=out / "sweep.json",
         picture=out / "panels.png",
     )
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         text = sweeptables.members_csv(summary)
         report.members.write_text(text, encoding="utf-8")
@@ -93,8 +93,6 @@ def write_sweep_report(
         report.markdown.write_text(_markdown(report), encoding="utf-8")
         report.json.write_text(_json(report), encoding="utf-8")
         _draw(report)
-    except OSError as error:
-        raise UserError(f"cannot write {error.filename}: {error.strerror}") from None
     return report
 
 

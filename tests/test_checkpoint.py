@@ -16,6 +16,7 @@ import pytest
 from rewire_jax import checkpoint
 from rewire_jax.checkpoint import (
     CheckpointError,
+    ForeignError,
     available,
     load,
     read_metadata,
@@ -23,6 +24,7 @@ from rewire_jax.checkpoint import (
     save,
 )
 from rewire_jax.errors import UserError
+from rewire_jax.version import __version__
 
 
 class Pair(NamedTuple):
@@ -183,10 +185,6 @@ def change_manifest(path: Path, old: str, new: str) -> None:
         (lambda path: (path / "manifest.json").write_text("{}"), "damaged or foreign"),
         (lambda path: (path / "manifest.json").write_bytes(b"\xff"), "damaged or for"),
         (lambda path: change_manifest(path, '"order": 0', '"order": 1'), "damaged or"),
-        (
-            lambda path: change_manifest(path, '"format": 1', '"format": 9'),
-            "format 9, not 1",
-        ),
     ],
 )
 def test_damage_is_told_in_one_line(saved: Path, damage: Any, says: str) -> None:
@@ -195,6 +193,13 @@ def test_damage_is_told_in_one_line(saved: Path, damage: Any, says: str) -> None
         load(saved, POLICY)
     assert str(saved) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_another_format_names_the_version(saved: Path) -> None:
+    change_manifest(saved, '"format": 1', '"format": 9')
+    change_manifest(saved, f'"version": "{__version__}"', '"version": "9.8"')
+    with pytest.raises(ForeignError, match=r"format 9, not 1; .* rewire_jax 9\.8"):
+        load(saved, POLICY)
 
 
 @pytest.mark.parametrize(
@@ -210,13 +215,13 @@ def test_damage_is_told_in_one_line(saved: Path, damage: Any, says: str) -> None
 def test_other_structure_shape_or_dtype_names_the_leaf(
     saved: Path, expected: Any, says: str
 ) -> None:
-    with pytest.raises(CheckpointError, match=says) as caught:
+    with pytest.raises(ForeignError, match=says) as caught:
         load(saved, {"policy": expected})
     assert "\n" not in str(caught.value)
 
 
 def test_unknown_item(saved: Path) -> None:
-    with pytest.raises(CheckpointError, match="no leaf where critic"):
+    with pytest.raises(ForeignError, match="no leaf where critic"):
         load(saved, {"critic": np.ones(1)})
 
 

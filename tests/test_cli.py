@@ -203,6 +203,38 @@ def test_help_names_the_settings_and_their_values(
         assert flag in shown
 
 
+@pytest.mark.parametrize("command", cli._COMMANDS)
+def test_what_is_unexpected_ends_in_a_line_too(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(arguments):
+        assert arguments == ["--some", "words"]
+        raise RuntimeError("a surprise\nof two lines")
+
+    monkeypatch.setitem(cli._COMMANDS, command, broken)
+    for more in ([], ["--debug"]):
+        with pytest.raises(SystemExit) as exit_:
+            cli.main([command, *more, "--some", "words"])
+        assert exit_.value.code == 1
+        *before, line = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: unexpected RuntimeError: a surprise; run again")
+        assert bool(before) == bool(more)
+    assert any("in broken" in each for each in before)
+
+
+def test_an_interruption_shows_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(cli._COMMANDS, "list", interrupted)
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["list"])
+    assert exit_.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 def test_nothing_is_imported_upward() -> None:
     # Every module of the package is loaded by now; none may wait for the command.
     assert "rewire_jax.cli" in sys.modules

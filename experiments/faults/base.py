@@ -13,7 +13,7 @@ import orbax.checkpoint as ocp
 
 from rewire_jax.runfolder import TABLES
 
-SETTINGS = {
+SETTINGS: dict[str, Any] = {
     "profile": "quick",
     "seeds": 2,
     "tasks": 3,
@@ -26,13 +26,26 @@ SETTINGS = {
     "report-every": 80,
     "checkpoint-every": 160,
     "hidden": 8,
+    "depth": 1,
     "batch-size": 16,
 }
 """Of runs that take seconds: three tasks, each of eight reports, three checkpoints."""
 
-FLAGS = tuple(str(word) for n, v in SETTINGS.items() for word in (f"--{n}", v))
-TRAIN = ("train", "probe/reach", *FLAGS)
-"""A run of `rewire` without --out: it keeps memory, and chooses among modes."""
+
+def train(scenario: str = "probe/reach", **changes: int) -> tuple[str, ...]:
+    """A small run of `rewire`, without --out.
+
+    Args:
+      scenario: that is learned.
+      changes: to `SETTINGS`, by names with underscores.
+    """
+    values = SETTINGS | {name.replace("_", "-"): x for name, x in changes.items()}
+    flags = (str(word) for n, v in values.items() for word in (f"--{n}", v))
+    return ("train", scenario, *flags)
+
+
+TRAIN = train()
+"""It keeps memory, and chooses among modes."""
 
 _QUICKLY = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
@@ -174,6 +187,12 @@ def _digest(item: Path) -> str:
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape}".encode())
         digest.update(arrays[name].tobytes())
     return digest.hexdigest()
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """All files of a folder, but for locks."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path: path.read_bytes() for path in files if path.name != ".lock"}
 
 
 def lost(expected: Counter[str], folder: Path) -> int:

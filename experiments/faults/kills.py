@@ -94,6 +94,16 @@ def moments(seed: int) -> list[list[Moment]]:
     return made
 
 
+def wait(process: subprocess.Popen[str], watched: Path, moment: Moment) -> None:
+    """Waits for a moment, or the end of the process that should bring it about."""
+    limit = time.monotonic() + _LONGEST
+    while process.poll() is None and time.monotonic() < limit:
+        if moment.seen(watched):
+            time.sleep(moment.delay)
+            break
+        time.sleep(0.0005)
+
+
 def kill(words: Sequence[str], watched: Path, moment: Moment) -> str:
     """Runs a command and kills it; says so if it ended before, else ""."""
     process = subprocess.Popen(
@@ -103,12 +113,7 @@ def kill(words: Sequence[str], watched: Path, moment: Moment) -> str:
         text=True,
         env=base.environment(),
     )
-    limit = time.monotonic() + _LONGEST
-    while process.poll() is None and time.monotonic() < limit:
-        if moment.seen(watched):
-            time.sleep(moment.delay)
-            break
-        time.sleep(0.0005)
+    wait(process, watched, moment)
     process.kill()
     _, said = process.communicate()
     ended = process.returncode != -signal.SIGKILL

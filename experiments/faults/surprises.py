@@ -1,0 +1,57 @@
+"""What nobody has thought of: errors that no command expects."""
+
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+from experiments.faults import base
+from experiments.faults.base import Case, Kind, Outcome, Ran
+from rewire_jax import cli
+
+_BROKEN = """
+import sys
+from rewire_jax import cli
+
+def broken(arguments):
+    raise RuntimeError("a surprise\\nof two lines")
+
+cli._COMMANDS = dict.fromkeys(cli._COMMANDS, broken)
+cli.main()
+"""
+
+
+def surprised(command: str, place: Path) -> Outcome:
+    """A command fails in a way of its own: in one line, and --debug says where."""
+    ran, debugged = (
+        Ran(done.returncode, done.stdout, done.stderr)
+        for done in (
+            subprocess.run(
+                [sys.executable, "-c", _BROKEN, command, *more],
+                capture_output=True,
+                text=True,
+                env=base.environment(),
+                cwd=place,
+                check=False,
+            )
+            for more in ((), ("--debug",))
+        )
+    )
+    told = "Traceback" in debugged.err and "in broken" in debugged.err
+    return Outcome(
+        ran.said,
+        base.first(
+            base.complaint(ran, "RuntimeError: a surprise", "--debug", status=1),
+            "" if told else f"no traceback with --debug: {debugged.err}",
+        ),
+        0,
+    )
+
+
+KINDS = (
+    Kind(
+        "surprise",
+        "an error that a command does not expect; --debug says where it is",
+        tuple(Case(name, partial(surprised, name)) for name in cli._COMMANDS),
+    ),
+)

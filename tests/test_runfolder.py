@@ -1,0 +1,75 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from rewire_jax import plan, runfolder
+from rewire_jax.config import to_json
+from rewire_jax.errors import UserError
+from rewire_jax.runfolder import HEADER, held
+from tests.tiny import tiny
+
+HEAD = {"settings": to_json(tiny()), "provenance": {"versions": {}, "commit": "abc"}}
+
+
+def test_one_at_a_time_has_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with held(folder, HEAD):
+        with (
+            pytest.raises(UserError, match="another process trains"),
+            held(folder, None),
+        ):
+            raise AssertionError
+        with pytest.raises(UserError, match="another run"), held(folder, HEAD):
+            raise AssertionError
+    with held(folder, None):
+        pass
+    with pytest.raises(UserError, match="another run"), held(folder, HEAD):
+        raise AssertionError
+
+
+def test_a_start_that_was_cut_short_is_no_obstacle(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    (tmp_path / f".{HEADER}").write_text("{")
+    with pytest.raises(UserError, match="holds no run"), held(tmp_path, None):
+        raise AssertionError
+    with held(tmp_path, HEAD):
+        assert runfolder.read_header(tmp_path)["format"] == runfolder.FORMAT
+
+
+def test_nothing_is_left_where_something_else_is(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    for header in (HEAD, None):
+        with pytest.raises(UserError), held(tmp_path, header):
+            raise AssertionError
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda head: head["settings"].update(lookahead=1),
+            "unknown setting lookahead",
+        ),
+        (lambda head: head["settings"]["sac"].update(a=1), "unknown setting a;"),
+        (lambda head: head["settings"].pop("tasks"), "no setting tasks;"),
+        (lambda head: head.update(format=7), "format 7, not 1"),
+    ],
+)
+def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> None:
+    head = json.loads(json.dumps(HEAD)) | {"format": runfolder.FORMAT}
+    change(head)
+    for versions, named in (
+        ({"rewire_jax": "9.8"}, "written by rewire_jax 9.8, commit abc"),
+        ({}, "written by rewire_jax of an unknown version"),
+    ):
+        head["provenance"]["versions"] = versions
+        (tmp_path / HEADER).write_text(json.dumps(head))
+        for read in (
+            lambda: plan.saved(tmp_path),
+            lambda: runfolder.compare(tmp_path, tiny()),
+        ):
+            with pytest.raises(UserError, match=said) as caught:
+                read()
+            assert named in str(caught.value)
