@@ -12,7 +12,7 @@ from rewire_jax.errors import UserError
 from rewire_jax.inspection import evaluate, info
 from rewire_jax.methods import register_method
 from rewire_jax.permutation import permute
-from rewire_jax.policy import load_policy
+from rewire_jax.policy import load_policies, load_policy
 from rewire_jax.presets import preset
 from rewire_jax.report import write_report
 from rewire_jax.scenarios import (
@@ -20,6 +20,7 @@ from rewire_jax.scenarios import (
     ScenarioSpec,
     list_scenarios,
     make_scenario,
+    register_domain,
     register_scenario,
 )
 from rewire_jax.sweeping import sweep
@@ -39,10 +40,12 @@ __all__ = [
     "info",
     "keep_compiled",
     "list_scenarios",
+    "load_policies",
     "load_policy",
     "make_scenario",
     "permute",
     "preset",
+    "register_domain",
     "register_method",
     "register_scenario",
     "sweep",

@@ -1,14 +1,16 @@
 """Policies of a finished or running run, as plain functions."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from rewire_jax import checkpoint, config, runfolder, standing, sweeping
 from rewire_jax.axes import configure
+from rewire_jax.config import Settings, require
 from rewire_jax.errors import UserError
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Spec
@@ -16,6 +18,37 @@ from rewire_jax.sweeping import Found
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
 """`[..., observations]` -> actions `[..., actions]` in [-1, 1]."""
+
+
+class Learned(NamedTuple):
+    """What a member has learned; its policies are made from nothing else.
+
+    Attributes:
+      params: what its method trains.
+      memory: what its method keeps from task to task; of `rewire`,
+        `orders` `[slots, L, n]`, the cached wirings.
+    """
+
+    params: Any
+    memory: Any
+
+
+class Policies(NamedTuple):
+    """The policies of all members of a run: arrays, and one pure function of them.
+
+    Attributes:
+      act: `(member, task, observation) -> action` for a member's `Learned`, a `[]` int
+        and `[..., observations]`; action `[..., actions]` in [-1, 1], without
+        exploration. It can be jitted, and vmapped over members, tasks or both.
+      members: what all have learned, `[seeds]` on the leading axis of every leaf.
+      seeds: of the members, in their order.
+      tasks: names of the sequence.
+    """
+
+    act: Callable[[Learned, jax.Array | int, jax.Array], jax.Array]
+    members: Learned
+    seeds: tuple[int, ...]
+    tasks: tuple[str, ...]
 
 
 def load_policy(
@@ -45,10 +78,7 @@ def load_policy(
     """
     folder = Path(run)
     kind = runfolder.kind(folder)
-    header = runfolder.read_header(folder, kind)
-    entry = find_method(header["settings"]["method"])
-    settings = config.from_json(header["settings"], entry.settings)
-    spec = Spec(**header["spec"])
+    header, settings, spec = _read(folder, kind)
     if not 0 <= task < spec.tasks:
         raise UserError(f"{folder} has tasks 0 to {spec.tasks - 1}, not {task}")
     if kind == "sweep":
@@ -69,21 +99,56 @@ def load_policy(
             raise UserError(
                 f"{folder} has no seed {seed}: see {runfolder.HEADER} there"
             )
-    method = entry.make(spec, settings.options)
-    params, memory = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf[found.place]), _load(found, method)
+    method = find_method(settings.method).make(spec, settings.options)
+    learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
+    policy = method.policy(*learned, jnp.asarray(task))
+    return functools.partial(_act, method, policy)
+
+
+def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
+    """All policies of a run at once, to be vmapped over, compared and taken apart.
+
+    Args:
+      run: folder of the run.
+      stage: as they were after this task's training; after the latest if None.
+
+    Raises:
+      UserError: no such run or stage, a sweep, or a damaged checkpoint.
+    """
+    folder = Path(run)
+    require(
+        runfolder.kind(folder) == "run",
+        f"{folder} holds a sweep, whose members differ in settings: load_policy gives "
+        "the policies of one",
     )
-    policy = method.policy(params, memory, jnp.asarray(task))
+    header, settings, spec = _read(folder, "run")
+    method = find_method(settings.method).make(spec, settings.options)
 
-    def act(observation: jax.Array) -> jax.Array:
-        mean, _ = method.act(policy, observation)
-        return jnp.tanh(mean)
+    def act(member: Learned, task: jax.Array | int, observation: jax.Array):
+        policy = method.policy(member.params, member.memory, jnp.asarray(task))
+        return _act(method, policy, observation)
 
-    return act
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    members = _load(Found(folder, stage, 0, settings.seeds), method)
+    return Policies(act, members, tuple(seeds), tuple(header["tasks"]))
 
 
-def _load(found: Found, method: Method) -> Any:
+def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
+    """A folder's header, and what it says."""
+    header = runfolder.read_header(folder, kind)
+    entry = find_method(header["settings"]["method"])
+    settings = config.from_json(header["settings"], entry.settings)
+    return header, settings, Spec(**header["spec"])
+
+
+def _act(method: Method, policy: Any, observation: jax.Array) -> jax.Array:
+    mean, _ = method.act(policy, observation)
+    return jnp.tanh(mean)
+
+
+def _load(found: Found, method: Method) -> Learned:
+    """What those have learned that were trained side by side, `[places]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.places))
     like = {"policy": jax.eval_shape(jax.vmap(method.init), keys)}
     path = standing.kept(found.folder, found.stage)
-    return checkpoint.load(path, like)[0]["policy"]
+    return Learned(*jax.tree.map(jnp.asarray, checkpoint.load(path, like)[0]["policy"]))

@@ -115,7 +115,8 @@ def make_scenario(
 
     Args:
       spec: a spec, or the name of a known one.
-      backend: physics backend, the domain's first if None; probes ignore it.
+      backend: physics backend, the domain's first if None; probes and
+        domains of one's own ignore it.
       reward: version of Meta-World's rewards, `"v1"` or `"v2"`; others ignore it.
 
     Returns:
@@ -129,7 +130,7 @@ def make_scenario(
             raise UserError(_unknown("scenario", spec, list(SCENARIOS)))
         spec = SCENARIOS[spec]
     kind = DOMAINS[spec.domain]
-    if backend is None or kind.backend == "probe":
+    if backend is None or kind.backend in ("probe", "own"):
         backend = kind.backend
     domain = kind.make(spec, backend, reward)
     names = list(dict.fromkeys(change.name for change in spec.changes))
@@ -162,6 +163,11 @@ def register_scenario(spec: ScenarioSpec) -> None:
     SCENARIOS[spec.name] = spec
 
 
+def register_domain(name: str, domain: Domain) -> None:
+    """Adds a domain of one's own, for specs to name; one of that name gives way."""
+    DOMAINS[name] = DomainKind(lambda spec, backend, reward: domain, "own")
+
+
 def list_scenarios() -> tuple[str, ...]:
     """The names of all known scenarios, sorted."""
     return tuple(sorted(SCENARIOS))
@@ -178,7 +184,8 @@ class DomainKind(NamedTuple):
 
     Attributes:
       make: `(spec, backend, reward) -> Domain`.
-      backend: that it is made for where none is named.
+      backend: that it is made for where none is named; "probe" and "own" are the only
+        one of theirs.
     """
 
     make: Callable[[ScenarioSpec, str, str], Domain]

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 import json
 import os
 import shutil
@@ -252,6 +253,39 @@ def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
     for wrong in ({"task": 9}, {"task": 0, "seed": 7}, {"task": 0, "stage": 8}):
         with pytest.raises(UserError):
             rewire_jax.load_policy(copy, **wrong)
+
+
+@pytest.mark.parametrize("stage", [None, 1])
+def test_all_policies_are_one_function_of_what_was_learned(run: Path, stage) -> None:
+    policies = rewire_jax.load_policies(run, stage=stage)
+    assert policies.seeds == (0, 1)
+    assert len(policies.tasks) == 4
+    observations = jax.random.normal(jax.random.key(0), (2, 4, 3, 2))
+    over_tasks = jax.vmap(policies.act, (None, 0, 0))
+    over_all = jax.jit(jax.vmap(over_tasks, (0, None, 0)))
+    actions = over_all(policies.members, jnp.arange(4), observations)
+    for seed, task in itertools.product(range(2), range(4)):
+        one = rewire_jax.load_policy(run, task=task, seed=seed, stage=stage)
+        np.testing.assert_allclose(
+            actions[seed, task], one(observations[seed, task]), atol=1e-6
+        )
+
+
+def test_what_is_learned_can_be_taken_apart(run: Path) -> None:
+    policies = rewire_jax.load_policies(run)
+    first = jax.tree.map(lambda leaf: leaf[0], policies.members)
+    orders = first.memory.orders
+    np.testing.assert_array_equal(
+        np.sort(orders, axis=-1), np.broadcast_to(np.arange(16), orders.shape)
+    )
+    # Whoever has another task's wiring acts otherwise.
+    exchanged = first._replace(memory=first.memory._replace(orders=orders[::-1]))
+    seen = jnp.array([0.3, -0.2])
+    assert not np.allclose(
+        policies.act(first, 0, seen), policies.act(exchanged, 0, seen), atol=1e-4
+    )
+    with pytest.raises(UserError, match="no checkpoint of task 8"):
+        rewire_jax.load_policies(run, stage=8)
 
 
 def test_evaluate_replays_a_run(run: Path) -> None:

@@ -2,13 +2,16 @@ import jax
 import numpy as np
 import pytest
 
+from rewire_jax.envs import probe
 from rewire_jax.envs.base import TaskChange
 from rewire_jax.errors import UserError
 from rewire_jax.scenarios import (
+    DOMAINS,
     SCENARIOS,
     ScenarioSpec,
     list_scenarios,
     make_scenario,
+    register_domain,
     register_scenario,
 )
 
@@ -206,6 +209,16 @@ def test_own_scenarios(monkeypatch):
         register_scenario(own(repeats=1))
     with pytest.raises(UserError, match="another"):
         register_scenario(own(name="ant/transfer"))
+
+
+def test_a_domain_of_ones_own(monkeypatch):
+    monkeypatch.setattr("rewire_jax.scenarios.DOMAINS", dict(DOMAINS))
+    domain = probe.make_domain("match")
+    register_domain("mine", domain)
+    scenario = make_scenario(own(domain="mine"), backend="spring")
+    assert scenario.environment is domain.environment
+    # It is not on a backend that it has never heard of.
+    assert scenario.backend == "own"
 
 
 @pytest.mark.parametrize(

@@ -376,6 +376,8 @@ def test_another_sweep_or_a_run_is_not_resumed(
     ):
         with pytest.raises(UserError, match=said):
             rewire_jax.load_policy(swept, **wrong)
+    with pytest.raises(UserError, match=r"holds a sweep, .* load_policy"):
+        rewire_jax.load_policies(swept)
     with pytest.raises(UserError, match=r"holds a sweep: .* load_policy"):
         rewire_jax.evaluate(swept)
 

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
-from rewire_jax.scenarios import DOMAINS, DomainKind, ScenarioSpec, register_scenario
+from rewire_jax import ScenarioSpec, TaskChange, register_domain, register_scenario
+from rewire_jax.envs.base import Domain, Environment, State, Task
 
 STRIDE = 0.1
 
@@ -46,7 +46,7 @@ CORRIDOR = Domain(
     Environment(reset, step, observation_size=1, action_size=1, episode_length=20),
     make_task,
 )
-DOMAINS["corridor"] = DomainKind(lambda spec, backend, reward: CORRIDOR, "own")
+register_domain("corridor", CORRIDOR)
 
 register_scenario(
     ScenarioSpec(
