@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax import checkpoint, config, runfolder, standing, sweeping
+from rewire_jax import runfolder, standing, sweeping
 from rewire_jax.axes import configure
 from rewire_jax.config import Settings, require
 from rewire_jax.errors import UserError
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Spec
+from rewire_jax.plan import saved
 from rewire_jax.sweeping import Found
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
@@ -135,9 +136,7 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
 
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
     """A folder's header, and what it says."""
-    header = runfolder.read_header(folder, kind)
-    entry = find_method(header["settings"]["method"])
-    settings = config.from_json(header["settings"], entry.settings)
+    header, settings = saved(folder, kind)
     return header, settings, Spec(**header["spec"])
 
 
@@ -149,6 +148,6 @@ def _act(method: Method, policy: Any, observation: jax.Array) -> jax.Array:
 def _load(found: Found, method: Method) -> Learned:
     """What those have learned that were trained side by side, `[places]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.places))
-    like = {"policy": jax.eval_shape(jax.vmap(method.init), keys)}
-    path = standing.kept(found.folder, found.stage)
-    return Learned(*jax.tree.map(jnp.asarray, checkpoint.load(path, like)[0]["policy"]))
+    like = jax.eval_shape(jax.vmap(method.init), keys)
+    learned = standing.read_policies(found.folder, found.stage, like)
+    return Learned(*jax.tree.map(jnp.asarray, learned))
