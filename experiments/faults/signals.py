@@ -103,12 +103,12 @@ def _case(
 
 
 def _runs(times: int) -> list[Case]:
-    """Six moments of a run that are not in what follows the last chunk."""
+    """Four moments of a run that are not in what follows the last chunk."""
     some = [moment for moment, *_ in kills.moments(_SEED + times)]
     last = f"task-{SETTINGS['tasks'] - 1:03d}"
     first = [moment for moment in some if not moment.name.startswith(last)]
     cases = [_case(TRAIN, "", moment, times) for moment in first]
-    return random.Random(_SEED).sample(cases, 6)
+    return random.Random(_SEED).sample(cases, 4)
 
 
 def _sweep(times: int) -> Case:
