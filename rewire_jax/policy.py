@@ -102,7 +102,7 @@ def load_policy(
             )
     method = find_method(settings.method).make(spec, settings.options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
-    policy = method.policy(*learned, jnp.asarray(task))
+    policy = method.policy(learned.params, learned.memory, jnp.asarray(task))
     return functools.partial(_act, method, policy)
 
 
