@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import re
+import signal
 import sys
 import threading
 import traceback
@@ -177,7 +178,8 @@ def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) ->
         said, hint, *_ = [" ".join(part) for rule, part in parts if not rule]
         close = re.findall(r"--[a-z-]+", hint) if hint.startswith("Perhaps") else []
         meant = f"; perhaps you meant {' or '.join(close)}" if close else ""
-        raise UserError(f"{' '.join(said.split())}{meant}; see {prog} --help") from None
+        said = " ".join(said.split()).rstrip(".")
+        raise UserError(f"{said}{meant}; see {prog} --help") from None
 
 
 def _peek(arguments: Sequence[str], **defaults: str | None) -> list[Any]:
@@ -385,9 +387,10 @@ command shows where an error comes from.
 @contextlib.contextmanager
 def _stoppable() -> Iterator[None]:
     """A second Ctrl-C ends the process if it does not end by itself in a second."""
-    over = threading.Event()
+    heard, over = threading.Event(), threading.Event()
 
     def end(times: int) -> None:
+        heard.set()
         if times == 2 and not over.wait(1.0):
             # A live display has hidden the cursor.
             Console(stderr=True).show_cursor()
@@ -403,6 +406,8 @@ def _stoppable() -> Iterator[None]:
             yield
         finally:
             over.set()
+            if heard.is_set():  # The process ends, and has no more to say.
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _ending(error: BaseException) -> tuple[str, int]:
@@ -412,7 +417,8 @@ def _ending(error: BaseException) -> tuple[str, int]:
     if isinstance(error, continual.Stopped):
         return str(error), _INTERRUPTED
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted", _INTERRUPTED
+        stopped = isinstance(error.__context__, continual.Stopped)  # and then again
+        return str(error.__context__) if stopped else "interrupted", _INTERRUPTED
     said = f"{type(error).__name__}: {error}".partition("\n")[0]
     return (
         f"error: unexpected {said}; run again with --debug to see where, and please "

@@ -15,7 +15,7 @@ from experiments.faults.base import SETTINGS, TRAIN, Case, Kind, Outcome, Ran
 from experiments.faults.kills import SWEEP, Moment
 
 _SEED = 5
-_MANY = 40_000
+_MANY = 160_000
 LONG = base.train(tasks=2, interactions=_MANY, report_every=_MANY, checkpoint_every=0)
 """Its tasks are a chunk each, which takes seconds."""
 HOSTED = base.train(
