@@ -27,7 +27,7 @@ option = $(if $(strip $(2)),--$(1) $(2))
 .DELETE_ON_ERROR:
 .PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
 	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
-	follow-readme faults docs clean
+	follow-readme notebooks faults docs clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' Makefile
@@ -88,7 +88,7 @@ export LOCK
 lint: setup ## Check style, format and types
 	$(RUN) -m ruff check
 	$(RUN) -m ruff format --check
-	$(RUN) -m mypy rewire_jax experiments docs
+	$(RUN) -m mypy rewire_jax experiments docs notebooks
 
 format: setup ## Mend what ruff can mend
 	$(RUN) -m ruff check --fix
@@ -146,6 +146,9 @@ follow-readme: setup ## Follow README.md in an empty folder, word for word
 faults: setup ## Try faults of many kinds, which must cost no result (KINDS: some)
 	$(RUN) -m experiments.try_faults $(call option,kinds,$(subst $(comma), ,$(KINDS)))
 
+notebooks: setup ## Execute the notebooks anew, in place
+	$(RUN) -m notebooks.execute
+
 docs: setup ## Build the documentation into site/, warnings being errors
 	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --fresh-env \
 		--doctree-dir build/doctrees docs site
@@ -153,5 +156,5 @@ docs: setup ## Build the documentation into site/, warnings being errors
 
 clean: ## Remove caches and build outputs; .venv and runs/ stay
 	rm -rf .jax_cache .mypy_cache .pytest_cache .ruff_cache build dist site \
-		docs/drawings *.egg-info
-	find rewire_jax experiments docs tests -name __pycache__ -type d -prune -exec rm -rf {} +
+		docs/drawings docs/notebooks *.egg-info
+	find rewire_jax experiments docs notebooks tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -10,7 +10,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # for docs and experiments
 
-from docs import drawings, made  # noqa: E402
+from docs import drawings, made, notebooks  # noqa: E402
 
 project = "rewire_jax"
 author = "the authors of rewire_jax"
@@ -48,8 +48,9 @@ def _fields(app: Any, what: str, name: str, each: Any, *rest: Any) -> Any:
 
 
 def setup(app: Any) -> None:
-    """Drawings and tables are made whenever the documentation is built."""
+    """Whenever the documentation is built, what is not written by hand is made."""
     app.connect("builder-inited", lambda app: drawings.write(ROOT / "docs/drawings"))
+    app.connect("builder-inited", lambda app: notebooks.write(ROOT / "docs/notebooks"))
     app.connect("source-read", made.fill)
     app.connect("autodoc-skip-member", _skip)
     app.connect("autodoc-process-signature", _fields)

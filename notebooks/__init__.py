@@ -1,0 +1,1 @@
+"""Notebooks to read, run and start from; `execute.py` runs them all."""
