@@ -12,7 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from experiments import suite
-from experiments.faults import folders, kills, signals, surprises, versions
+from experiments.faults import (
+    damage,
+    disk,
+    folders,
+    hostile,
+    kills,
+    mistakes,
+    signals,
+    surprises,
+    versions,
+)
 from experiments.faults.base import Impossible, Kind
 from rewire_jax import runfolder
 from rewire_jax.config import require
@@ -26,6 +36,10 @@ KINDS: dict[str, Kind] = {
         *folders.KINDS,
         *versions.KINDS,
         *surprises.KINDS,
+        *damage.KINDS,
+        *disk.KINDS,
+        *mistakes.KINDS,
+        *hostile.KINDS,
     )
 }
 READING = (

@@ -70,11 +70,17 @@ def reading(what: Path | str) -> Iterator[None]:
 
 def text(path: Path) -> str:
     """What a file holds; `UserError` if it cannot be read."""
+    # A crash may cut inside a character; JSON then refuses the line as it should.
+    return raw(path).decode("utf-8", errors="replace")
+
+
+def raw(path: Path) -> bytes:
+    """The bytes of a file; `UserError` if it cannot be read."""
     try:
+        # A device may have no end, and a pipe no beginning.
         if path.exists() and not path.is_file():
             raise UserError(f"cannot read {path}: not a file")
-        # A crash may cut inside a character; JSON then refuses the line as it should.
-        return path.read_text(encoding="utf-8", errors="replace")
+        return path.read_bytes()
     except FileNotFoundError:
         raise UserError(f"{path} is missing: not the folder of a run") from None
     except OSError as error:

@@ -25,7 +25,7 @@ import jax
 
 from rewire_jax import config
 from rewire_jax.errors import UserError, writing
-from rewire_jax.jsonlines import document, reading
+from rewire_jax.jsonlines import document, raw, reading
 from rewire_jax.version import __version__
 
 FORMAT = 1
@@ -140,15 +140,17 @@ def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
     Raises:
       UserError: there is none, one of another format, or of the other kind.
     """
-    if not (folder / HEADER).exists():
-        raise UserError(f"{folder} holds no {kind}: there is no {HEADER}")
+    # Unlike a Path's, it is False where one has no right to look.
+    if not os.path.exists(folder / HEADER):  # noqa: PTH110
+        raise UserError(f"{folder} holds no {kind}: there is no {HEADER} to be read")
     header = document(folder / HEADER)
     check_format(folder, header)
     found = header.get("kind", "run")
     if found != kind:
         raise UserError(f"{folder} holds a {found}, not a {kind}")
     with reading(folder / HEADER):
-        header["settings"]["method"]
+        if not isinstance(header["settings"]["method"], str):
+            raise ValueError("method is no name")
     return header
 
 
@@ -256,10 +258,7 @@ def _parts(mark: Mark) -> tuple[int, str]:
 
 
 def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes() if path.exists() else b""
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    return raw(path) if path.exists() else b""
 
 
 def _digest(held: bytes) -> str:
