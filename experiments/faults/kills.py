@@ -172,11 +172,21 @@ def _sweeps(seed: int) -> tuple[Case, ...]:
     return tuple(cases)
 
 
+def _runs(writing: bool) -> tuple[Case, ...]:
+    """The moments of a run while a checkpoint is written, or the others."""
+    return tuple(
+        _case(TRAIN, "", some)
+        for some in moments(_SEED)
+        if some[0].name.endswith("written") == writing
+    )
+
+
 KINDS = (
+    Kind("kill", "a run is killed (SIGKILL), and resumed", _runs(writing=False)),
     Kind(
-        "kill",
-        "a run is killed (SIGKILL), some twice, and resumed",
-        tuple(_case(TRAIN, "", some) for some in moments(_SEED)),
+        "kill-writing",
+        "a run is killed while it writes a checkpoint, and resumed",
+        _runs(writing=True),
     ),
-    Kind("kill-sweep", "a sweep is killed and resumed", _sweeps(_SEED)),
+    Kind("kill-sweep", "a sweep is killed, and resumed", _sweeps(_SEED)),
 )
