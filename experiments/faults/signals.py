@@ -19,7 +19,12 @@ _MANY = 160_000
 LONG = base.train(tasks=2, interactions=_MANY, report_every=_MANY, checkpoint_every=0)
 """Its tasks are a chunk each, which takes seconds."""
 HOSTED = base.train(
-    "continual_world/window-close", tasks=1, eval_episodes=1, selection_episodes=1
+    "continual_world/window-close",
+    tasks=1,
+    envs=2,
+    update_every=10,
+    eval_episodes=1,
+    selection_episodes=1,
 )
 """Its simulators are stepped on the host."""
 
