@@ -496,14 +496,16 @@ def permuted_l2(spec: Spec, options: FtL2Settings) -> Method:
             x = networks.activate(permute(networks.affine(layer, x), scores, 0.5))
         return networks.gaussian(networks.affine(params.head, x))
 
-    def penalty(key, params, memory, context, observation, gaussian):
-        del key, context, observation, gaussian
+    def moved(params, memory):
         trained, previous = memory
         apart = jax.tree.map(
             lambda a, b: jnp.sum((a - b) ** 2), params.hidden, previous
         )
-        distance = jnp.where(trained, sum(jax.tree.leaves(apart)), 0.0)
-        return options.coefficient * distance, {"alignment": distance}
+        return jnp.where(trained, sum(jax.tree.leaves(apart)), 0.0)
+
+    def penalty(key, params, memory, context, observation, gaussian):
+        del key, context, observation, gaussian
+        return options.coefficient * moved(params, memory), {}
 
     def policy(params, memory, task):
         del memory, task
@@ -514,6 +516,7 @@ def permuted_l2(spec: Spec, options: FtL2Settings) -> Method:
         start_task=start_task,
         distribution=distribution,
         penalty=penalty,
+        inspect=lambda params, memory, _: {"alignment": moved(params, memory)},
         end_task=lambda params, memory, task, selection: (
             params,
             (jnp.asarray(True), params.hidden),

@@ -269,22 +269,23 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         other = jax.lax.stop_gradient(forward(params, memory, scores, key, observation))
         divergence = _DIVERGENCES[options.distillation](other, gaussian)
         distillation = jnp.where(modes > 1, jnp.mean(divergence), 0.0)
+        loss = options.alpha * DISTILLED_STATES * distillation
+        return loss + options.beta * alignment(params, memory), {
+            "distillation": distillation
+        }
+
+    def alignment(params, memory):
         if options.alignment == "off":
-            alignment = wiring.squared_distance(params.hidden, memory.previous)
+            loss = wiring.squared_distance(params.hidden, memory.previous)
         else:
-            alignment = wiring.alignment_loss(
+            loss = wiring.alignment_loss(
                 params.hidden,
                 memory.previous,
                 params.adapters,
                 options.adapter_tau,
                 expanded=options.alignment == "expanded",
             )
-        alignment = jnp.where(memory.learned > 0, alignment, 0.0)
-        loss = options.alpha * DISTILLED_STATES * distillation
-        return loss + options.beta * alignment, {
-            "distillation": distillation,
-            "alignment": alignment,
-        }
+        return jnp.where(memory.learned > 0, loss, 0.0)
 
     def adjust_updates(updates, memory):
         del memory
@@ -314,7 +315,11 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         pairs = jnp.mean(jax.vmap(against, (0, None))(gaussians, gaussians), axis=-1)
         # That of a mode with itself is 0.
         total = jnp.sum(jnp.where(valid[:, None] & valid, pairs, 0.0))
-        return {"mode_divergence": total / jnp.maximum(modes * (modes - 1), 1)}
+        return {
+            "mode_divergence": total / jnp.maximum(modes * (modes - 1), 1),
+            # Its gradient needs less than its value: updates do without.
+            "alignment": alignment(params, memory),
+        }
 
     def end_task(params, memory, task, selection):
         order = jnp.argsort(params.scores[0], axis=-1)
