@@ -160,9 +160,9 @@ def run(job: HostLoop) -> None:
         table.append(names + cells)
     title = f"{job.scenario}, paper profile: milliseconds for 50 steps and 50 updates"
     notes = [
-        f"Medians of {job.rounds} rounds; simulators and updates were timed alone. With "
-        "overlap, the next steps are made while updates go on, by the policy before "
-        "these."
+        f"Medians of {job.rounds} rounds; simulators and updates were timed alone. "
+        "With overlap, the next steps are made while updates go on, by the policy "
+        "before these."
     ]
     suite.write(job.out, title, table, notes, rows)
 
