@@ -168,7 +168,7 @@ def follow(
                 stdin=subprocess.DEVNULL,
                 check=False,
             )
-            first = code.strip().splitlines()[0]
+            first = code.strip().splitlines()[0].removesuffix(" \\")
             status, seconds = done.returncode, time.monotonic() - start
             yield Done(section.title, first, status == 0, status, seconds)
         for path in section.told:
