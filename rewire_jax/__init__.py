@@ -14,6 +14,7 @@ from rewire_jax.methods import register_method
 from rewire_jax.permutation import permute
 from rewire_jax.policy import load_policies, load_policy
 from rewire_jax.presets import preset
+from rewire_jax.rendering import render
 from rewire_jax.report import write_report
 from rewire_jax.scenarios import (
     Scenario,
@@ -48,6 +49,7 @@ __all__ = [
     "register_domain",
     "register_method",
     "register_scenario",
+    "render",
     "sweep",
     "train",
     "write_report",

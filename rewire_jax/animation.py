@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from rewire_jax import film as films
-from rewire_jax.errors import UserError
+from rewire_jax.errors import UserError, writing
 from rewire_jax.film import Film
 
 _FRAME = 0.05  # seconds; frames of the film between these are left out
@@ -40,7 +40,7 @@ def write_gif(
     ends = np.round((frames + step) * film.seconds / _TICK)
     durations = np.diff(ends, prepend=0) * _TICK * 1000
     first, *others = map(Image.fromarray, _draw(film, frames, width, height))
-    try:
+    with writing(path):
         first.save(
             path,
             save_all=True,
@@ -48,8 +48,6 @@ def write_gif(
             duration=durations.astype(int).tolist(),
             loop=0,
         )
-    except OSError as error:
-        raise UserError(f"cannot write to {path}: {error.strerror}") from error
 
 
 def _draw(film: Film, frames: Any, width: int, height: int) -> list[Any]:
@@ -71,6 +69,7 @@ def _draw(film: Film, frames: Any, width: int, height: int) -> list[Any]:
     # Sites stay where they were when the model was made.
     option.sitegroup[:] = 0
     scene = mujoco.MjvScene(model, maxgeom=10 * model.ngeom)
+    scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
     area = mujoco.MjrRect(0, 0, width, height)
     pictures = []
     with _opened(model, width, height) as context:

@@ -25,6 +25,7 @@ from rewire_jax import (
     inspection,
     interrupts,
     population,
+    rendering,
     report,
     runfolder,
     sweeping,
@@ -112,6 +113,31 @@ class Evaluate:
     episodes: int = 128
     seed: int = 0
     json: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render:
+    """Shows an episode of a run: a web page, and a GIF where MuJoCo can draw one.
+
+    Attributes:
+      run: folder of the run, or of a sweep.
+      task: which of the sequence to play, from 0.
+      seed: whose policy; the run's first if not given.
+      stage: as it was after this task's training; the latest if not given.
+      member: of a sweep, in place of the seed: a number in members.csv.
+      episode: which one; where it starts follows from this number.
+      out: the page; the GIF lies beside it.
+      seconds: of the episode in the GIF; 0 for no GIF.
+    """
+
+    run: tyro.conf.Positional[Path]
+    task: int
+    seed: int | None = None
+    stage: int | None = None
+    member: int | None = None
+    episode: int = 0
+    out: Path = Path("episode.html")
+    seconds: float = 10.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -307,6 +333,11 @@ def _evaluate(arguments: Sequence[str]) -> None:
         )
 
 
+def _render(arguments: Sequence[str]) -> None:
+    made = rendering.render(**vars(parse(Render, "render", arguments)))
+    print(made.title, made.caption, made.page, made.gif or made.note, sep="\n")
+
+
 def _report(arguments: Sequence[str]) -> None:
     asked = parse(Report, "report", arguments)
     if "sweep" in map(runfolder.kind, asked.runs):
@@ -361,6 +392,7 @@ _COMMANDS = {
     "train": _train,
     "sweep": _sweep,
     "evaluate": _evaluate,
+    "render": _render,
     "report": _report,
     "info": _info,
     "list": _list,
@@ -373,6 +405,8 @@ _USAGE = """usage: rewire-jax COMMAND ...
   sweep SCENARIO --out SWEEP [--k 1 2 3] [--axis NAME VALUE ...] [--SETTING VALUE ...]
       the same for every combination of settings and every seed, as one program
   evaluate RUN    play the tasks of a run with what it has learned
+  render RUN --task T
+      show an episode of a run as a web page, and as a GIF where that can be drawn
   report RUN...   tables and pictures of runs, side by side
   info SCENARIO   tasks, budgets, backend, and the model size of each method
   list            scenarios and methods

@@ -84,7 +84,9 @@ def _name(geom: int) -> str:
 
 def _scene(film: Film) -> trimesh.Scene:
     """The first frame, a node for each geometry."""
-    scene = trimesh.Scene()
+    # Without a name of ours a camera gets another one each time; the player moves it.
+    camera = trimesh.scene.Camera(name="camera", fov=(40, 40))
+    scene = trimesh.Scene(camera=camera, camera_transform=np.eye(4))
     for geom in films.solids(film):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = film.rotation[0, geom], film.position[0, geom]
