@@ -74,7 +74,11 @@ def attempt(kind: Kind, folder: Path) -> list[dict[str, Any]]:
         except Impossible as why:
             print(f"{kind.name}, {case.name}: not tried, {why}", flush=True)
             continue
-        rows.append({"case": case.name, "ok": came.ok, **came._asdict()})
+        told = came._replace(
+            said=came.said.replace(f"{folder}/", ""),
+            wrong=came.wrong.replace(f"{folder}/", ""),
+        )
+        rows.append({"case": case.name, "ok": came.ok, **told._asdict()})
         print(f"{kind.name}, {case.name}: {came.wrong or 'ok'}", flush=True)
     return rows
 
