@@ -215,6 +215,8 @@ def _read_item(folder: Path, like: Any) -> Any:
 
 def _check_sizes(found: Any, like: Any) -> None:
     """Raises `ValueError` unless stored arrays are as expected; reads none of them."""
+    if found is None:
+        raise ValueError("what arrays it has cannot be told")
     for i, leaf in enumerate(jax.tree.leaves(like)):
         if 0 not in leaf.shape:
             want = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf

@@ -199,9 +199,10 @@ def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) ->
     except SystemExit as exit_:
         if not exit_.code:
             raise
-        lines = [line.strip("│ ") for line in box.getvalue().splitlines()[1:]]
-        parts = itertools.groupby(lines, lambda line: line.startswith("─"))
-        said, hint, *_ = [" ".join(part) for rule, part in parts if not rule]
+        # Drawn with minus signs and bars where the terminal has no better.
+        lines = [line.strip("│| ") for line in box.getvalue().splitlines()[1:]]
+        parts = itertools.groupby(lines, lambda line: bool(line.strip("─╰╯-+")))
+        said, hint, *_ = [*(" ".join(part) for text, part in parts if text), ""]
         close = re.findall(r"--[a-z-]+", hint) if hint.startswith("Perhaps") else []
         meant = f"; perhaps you meant {' or '.join(close)}" if close else ""
         said = " ".join(said.split()).rstrip(".")
@@ -454,6 +455,12 @@ def _ending(error: BaseException) -> tuple[str, int]:
         stopped = isinstance(error.__context__, continual.Stopped)  # and then again
         return str(error.__context__) if stopped else "interrupted", _INTERRUPTED
     said = f"{type(error).__name__}: {error}".partition("\n")[0]
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in said:
+        return (
+            "error: out of memory: lower --seeds, --envs, --buffer, --hidden or "
+            "--eval-episodes",
+            2,
+        )
     return (
         f"error: unexpected {said}; run again with --debug to see where, and please "
         "report it",

@@ -177,7 +177,7 @@ _AT_LEAST: dict[str, float] = {
 # Counters have 32 bits, as floats have; the others only keep loops from being endless.
 _LARGEST = 2**31
 _LARGEST_FLOAT = 3.4e38
-_AT_MOST = {"seeds": 65_536, "depth": 1_000}
+_AT_MOST = {"seeds": 4_096, "depth": 1_000}
 _POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
 _SHARE = ("discount", "target_rate")
 _KINDS: dict[Any, tuple[type, str]] = {

@@ -3,6 +3,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 from fake_run import TRIPLET, write_alone, write_cw
 
@@ -67,7 +68,11 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("probe/reach --warmup 20000", "--warmup"),
         ("probe/reach --envs 0", "--envs"),
         ("probe/reach --seeds many", "many"),
-        ("probe/reach --sedes 3", "--sedes"),
+        ("probe/reach --sedes 3", "perhaps you meant --seeds"),
+        ("probe/reach --seeds 99999999999", "--seeds must be at most 4096"),
+        ("probe/reach --hidden 2000000000", "lower --seeds"),
+        ("probe/reach --scenario ant/transfer", "--scenario"),
+        ("probe/reach --backend mjx", "--backend"),
         ("probe/reach --time-limit never", "never"),
         ("", "scenario"),
     ],
@@ -220,6 +225,16 @@ def test_what_is_unexpected_ends_in_a_line_too(
         assert line.startswith("error: unexpected RuntimeError: a surprise; run again")
         assert bool(before) == bool(more)
     assert any("in broken" in each for each in before)
+
+
+def test_too_little_memory_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def greedy(arguments):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setitem(cli._COMMANDS, "list", greedy)
+    assert "lower --seeds, --envs" in fails(capsys, "list")
 
 
 def test_an_interruption_shows_no_traceback(

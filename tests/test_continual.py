@@ -179,6 +179,20 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(
         assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes()
 
 
+@pytest.mark.parametrize("table", TABLES)
+def test_a_table_that_lost_rows_is_written_again(
+    run: Path, tmp_path: Path, table: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    lines = (copy / table).read_text().splitlines(keepends=True)
+    (copy / table).write_text("".join(lines)[:-3])
+    continual.train(tiny(), copy, resume=True)
+    assert f"{table} has lost or foreign rows" in capsys.readouterr().err
+    for name in TABLES:
+        assert (copy / name).read_bytes() == (run / name).read_bytes()
+    assert checkpoints(copy) == checkpoints(run)
+
+
 def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     changes = [
         TaskChange(name, extra={"goal": goal})

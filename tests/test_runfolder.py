@@ -73,3 +73,26 @@ def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> No
             with pytest.raises(UserError, match=said) as caught:
                 read()
             assert named in str(caught.value)
+
+
+def test_what_was_written_since_is_cut_off(tmp_path: Path) -> None:
+    runfolder.append(tmp_path, "results.jsonl", [{"a": 1}, {"a": 2}])
+    marks = json.loads(json.dumps(runfolder.marks(tmp_path)))
+    runfolder.append(tmp_path, "results.jsonl", [{"a": 3}])
+    runfolder.append(tmp_path, "timing.jsonl", [{"a": 4}])
+    assert runfolder.changed(tmp_path, marks) is None
+    runfolder.cut(tmp_path, marks)
+    assert (tmp_path / "results.jsonl").read_text() == '{"a": 1}\n{"a": 2}\n'
+    assert (tmp_path / "timing.jsonl").read_text() == ""
+
+
+@pytest.mark.parametrize("text", ['{"a": 1}\n{"a"', '{"a": 1}\n{"a": 7}\n', ""])
+def test_rows_that_are_lost_or_others_are_noticed(tmp_path: Path, text: str) -> None:
+    runfolder.append(tmp_path, "results.jsonl", [{"a": 1}, {"a": 2}])
+    marks = runfolder.marks(tmp_path)
+    (tmp_path / "results.jsonl").write_text(text)
+    assert runfolder.changed(tmp_path, marks) == tmp_path / "results.jsonl"
+    # Earlier versions noted lengths alone.
+    lengths = {"results.jsonl": 18}
+    noticed = runfolder.changed(tmp_path, lengths) is not None
+    assert noticed == (len(text) < 18)

@@ -18,6 +18,7 @@ from rewire_jax.methods import METHODS
 
 _SEED = 17
 _SCENARIO = "probe/reach"
+_MANY = "2000000000"
 # Given in another way, or of no meaning here.
 _APART = ("scenario", "sac", "options", "paper_interactions", "overlap", "reward")
 
@@ -175,8 +176,10 @@ _CONTRADICTORY = (
     Mistake(_train("--modes", "5", "--mode-slots", "3"), "--mode-slots"),
     Mistake(_train("--warmup", "640"), "--warmup"),
     Mistake(_train("--buffer", "8"), "--buffer"),
-    Mistake(_train("--buffer", "2000000000", "--seeds", "60000"), "--buffer"),
-    Mistake(_train("--hidden", "2000000000"), "--hidden"),
+    Mistake(
+        _train("--buffer", _MANY, "--interactions", _MANY, "--seeds", "500"), "--buffer"
+    ),
+    Mistake(_train("--hidden", _MANY), "--hidden"),
     Mistake(_train("--tasks", "5"), "--tasks"),
     Mistake(_train("--overlap"), "--overlap"),
     Mistake(_train("--keep", "0.5"), "--keep"),
@@ -185,7 +188,7 @@ _CONTRADICTORY = (
     Mistake(("train", "probe/reech", *TRAIN[2:], "--out", "{out}"), "probe/reach"),
     Mistake(TRAIN, "--out"),
     Mistake(_sweep(), "axis"),
-    Mistake(_sweep("--k"), "modes"),
+    Mistake(_sweep("--k"), "'k'"),
     Mistake(_sweep("--axis", "betta", "1", "2"), "betta"),
     Mistake(_sweep("--axis", "hidden", "8", "16"), "hidden"),
     Mistake(_sweep("--beta", "1", "x"), "beta"),
