@@ -97,7 +97,7 @@ def report(found: Mapping[str, Any]) -> str:
         how = found[name]["provenance"]
         origins += [f"- {name}: {how['device']}, commit `{how['commit']}`"]
     table = markdown(head, lines)
-    return "\n".join(["# Faults", "", *table, "", READING, "", *origins]) + "\n"
+    return "\n".join(["# Faults", "", *table, READING, "", *origins]) + "\n"
 
 
 def run(job: Faults) -> None:
