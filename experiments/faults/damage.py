@@ -11,6 +11,7 @@ import numpy as np
 import rewire_jax
 from experiments.faults import base, kills
 from experiments.faults.base import SETTINGS, TRAIN, Case, Kind, Outcome
+from experiments.faults.kills import SWEEP
 
 _SEED = 11
 _TASKS = SETTINGS["tasks"]
@@ -118,6 +119,25 @@ def finished(
     return Outcome("", wrong, base.lost(base.results(whole), folder))
 
 
+def sweep(
+    change: Callable[[bytes, int, int], bytes], number: int, place: Path
+) -> Outcome:
+    """What a sweep's next task begins from: deleted as told, it is trained again."""
+    whole = base.unbroken(place, *SWEEP)
+    folder = Path(shutil.copytree(whole, place / "sweep"))
+    for later in folder.glob("task-00[12]"):
+        shutil.rmtree(later)
+    batch = folder / "task-000" / "batch-000"
+    file = damage(batch / "checkpoints" / "task-001", change, number)
+    command = (*SWEEP, "--out", folder, "--resume")
+    ran = base.run(*command)
+    wrong = base.complaint(ran, file, f"delete {batch}")
+    shutil.rmtree(batch)
+    again = base.run(*command)
+    wrong = base.first(wrong, base.failed(again), base.different(folder, whole))
+    return Outcome(ran.said, wrong, base.lost(base.results(whole), folder))
+
+
 def cut_last(lines: list[str]) -> str:
     """The last line is cut in its middle."""
     return "\n".join(lines[:-1]) + "\n" + lines[-1][: len(lines[-1]) // 2]
@@ -162,7 +182,6 @@ def table(
     return Outcome(said, wrong, base.lost(base.results(whole), folder))
 
 
-_CHANGES = (truncate, flip)
 _CUTS: dict[str, tuple[Callable[[list[str]], str], ...]] = {
     "results.jsonl": (cut_last, cut_middle, empty, foreign, twice),
     "training.jsonl": (cut_last, empty, foreign),
@@ -190,9 +209,8 @@ KINDS = (
         "a checkpoint is truncated, or a bit of it flipped",
         tuple(
             Case(f"{kind.__name__}, {change.__name__} {n}", partial(kind, change, n))
-            for change in _CHANGES
-            for n in range(20)
-            for kind in ((middle, finished)[n % 2],)
+            for change in (truncate, flip)
+            for n, kind in enumerate([middle, finished] * 10 + [sweep])
         ),
     ),
     Kind(
