@@ -110,8 +110,8 @@ def _case(
 def _runs(times: int) -> list[Case]:
     """Four moments of a run that are not in what follows the last chunk."""
     some = [moment for moment, *_ in kills.moments(_SEED + times)]
-    last = f"task-{SETTINGS['tasks'] - 1:03d}"
-    first = [moment for moment in some if not moment.name.startswith(last)]
+    late = tuple(f"task-{SETTINGS['tasks'] - n:03d}" for n in (1, 0))
+    first = [moment for moment in some if not moment.name.startswith(late)]
     cases = [_case(TRAIN, "", moment, times) for moment in first]
     return random.Random(_SEED).sample(cases, 4)
 
