@@ -44,7 +44,7 @@ def colour(film: Film, geom: int) -> Array:
     """`[4]`, red, green, blue and opacity in [0, 1], by MuJoCo's rule."""
     model = film.model
     own, material = model.geom_rgba[geom], model.geom_matid[geom]
-    default = np.array_equal(own, np.float32([0.5, 0.5, 0.5, 1.0]))
+    default = np.array_equal(own, [0.5, 0.5, 0.5, 1.0])
     return model.mat_rgba[material] if material >= 0 and default else own
 
 

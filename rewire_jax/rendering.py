@@ -136,8 +136,10 @@ def _learned(folder: Path, member: int | None) -> int:
 def _play(scenario: Scenario, task: Task, act: PolicyFunction, episode: int) -> _Played:
     """Plays one episode; `UserError` if there is nothing to see."""
     environment = scenario.environment
-    play = _hosted if isinstance(environment, HostEnvironment) else _simulated
-    played = play(environment, task, jax.jit(act), episode)
+    if isinstance(environment, HostEnvironment):
+        played = _hosted(environment, task, jax.jit(act), episode)
+    else:
+        played = _simulated(environment, task, jax.jit(act), episode)
     if played is None:
         raise UserError(
             f"{scenario.name} on {scenario.backend} has nothing to see: halfcheetah, "
@@ -175,7 +177,9 @@ def _hosted(
     if seen is None:
         return None
     frames = [(seen.data.geom_xpos.copy(), seen.data.geom_xmat.copy())]
-    rewards, success, ended = [], [], False
+    rewards: list[float] = []
+    success: list[bool] = []
+    ended = False
     while len(rewards) < environment.episode_length and not ended:
         action = act(observation * np.asarray(task.observation_mask))
         observation, reward, ended, _, info = env.step(
