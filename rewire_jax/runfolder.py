@@ -222,7 +222,7 @@ def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
 
 def marks(folder: Path) -> dict[str, Mark]:
     """Where each table ends, to come back to with `cut`."""
-    found = {}
+    found: dict[str, Mark] = {}
     for table in TABLES:
         held = _bytes(folder / table)
         found[table] = len(held), _digest(held)

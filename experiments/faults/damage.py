@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 import rewire_jax
@@ -69,7 +70,7 @@ def resumed(folder: Path, whole: Path, *told: str) -> str:
 def play(folder: Path, stage: int) -> np.ndarray:
     """What a policy of the run does, loaded as a library's user loads it."""
     policy = rewire_jax.load_policy(folder, task=stage, seed=1, stage=stage)
-    return np.asarray(policy(np.linspace(-1, 1, 2, dtype=np.float32)))
+    return np.asarray(policy(jnp.linspace(-1, 1, 2)))
 
 
 def refused(folder: Path, whole: Path, stage: int, file: str) -> str:
@@ -129,7 +130,7 @@ def sweep(
         shutil.rmtree(later)
     batch = folder / "task-000" / "batch-000"
     file = damage(batch / "checkpoints" / "task-001", change, number)
-    command = (*SWEEP, "--out", folder, "--resume")
+    command = (*SWEEP, "--out", str(folder), "--resume")
     ran = base.run(*command)
     wrong = base.complaint(ran, file, f"delete {batch}")
     shutil.rmtree(batch)

@@ -136,7 +136,7 @@ def library(draw: random.Random, known: Sequence[Setting]) -> Mistake:
     """A value of another type, in Python."""
     mine = [s for s in known if s.method in ("ft1", "rewire")]
     setting = draw.choice([s for s in mine if s.kind in (int, float, str)])
-    value = draw.choice([None, [1], "3", {}, True, float("nan")])
+    value: Any = draw.choice([None, [1], "3", {}, True, float("nan")])
     if setting.kind is str:
         value = draw.choice([None, 3, ["rewire"]])
     call = json.dumps([setting.name, value, "{out}"]).replace("{}", "{{}}")
