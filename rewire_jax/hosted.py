@@ -141,9 +141,10 @@ def _compile(
         return jax.vmap(of)(time + jnp.arange(shape.every))
 
     def act(members, draws, number, acting, label, observation, steps):
-        def one(member, draws, *arguments):
+        def one(member, draws, acting, label, observation, steps):
             draw = jax.tree.map(lambda leaf: leaf[number], draws)
-            return exploring.explore(draw, *arguments, make(member))
+            method = make(member)
+            return exploring.explore(draw, acting, label, observation, steps, method)
 
         return jax.vmap(one)(members, draws, acting, label, observation, steps)
 
