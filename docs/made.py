@@ -248,7 +248,7 @@ def results(prefix: str) -> str:
         pages = path.glob("*.md") if path.is_dir() else [path]
         parts += [
             f"````{{include}} ../{page.relative_to(ROOT).as_posix()}\n"
-            ":relative-images:\n:heading-offset: 2\n````"
+            ":relative-images:\n:heading-offset: 1\n````"
             for page in sorted(pages)
             if page.suffix == ".md"
         ]
