@@ -1,6 +1,7 @@
 """A film as an animated picture, where MuJoCo can draw without a window."""
 
 import contextlib
+import copy
 import os
 import sys
 from collections.abc import Iterator
@@ -52,7 +53,7 @@ def write_gif(
 
 def _draw(film: Film, frames: Any, width: int, height: int) -> list[Any]:
     """`[height, width, 3]` uint8 for each of the frames."""
-    model = film.model.__copy__()
+    model = copy.copy(film.model)
     # A plane has no end in the simulation, whatever is drawn of it. What is on it is
     # repeated every two metres.
     planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE

@@ -7,6 +7,7 @@ under a temporary name and renamed when it is on disk: give checkpoints names of
 their own, in the order of time. A folder of checkpoints has one writer at a time.
 """
 
+import errno
 import hashlib
 import itertools
 import json
@@ -31,6 +32,8 @@ _FORMAT = 1
 _MANIFEST = "manifest.json"
 _TEMPORARY = ".tmp-"
 _KINDS = (np.bool_, np.number, jax.dtypes.prng_key)
+# Errors of what is not there, or is something else; those that we raise have none.
+_MISSING = (None, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP)
 
 
 class CheckpointError(UserError):
@@ -104,6 +107,7 @@ def load(
     Raises:
       CheckpointError: it is missing or damaged.
       ForeignError: it differs from `items_like`, or is of another format.
+      UserError: the system does not let it be read.
     """
     path = Path(path).absolute()
     content = _read_manifest(path)
@@ -117,7 +121,7 @@ def load(
             _verify(path, name, content["files"])
         items = {name: _read_item(path / name, x) for name, x in items_like.items()}
         return items, content["metadata"]
-    except ForeignError:
+    except (ForeignError, MemoryError):
         raise
     # What is not its own makes Orbax fail in many ways.
     except Exception as error:
@@ -129,8 +133,9 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
     Raises:
       CheckpointError: the manifest is missing or damaged.
+      UserError: the system does not let it be read.
     """
-    return _read_manifest(Path(path))["metadata"]
+    return _read_manifest(Path(path)).get("metadata", {})
 
 
 def available(folder: Path) -> list[Path]:
@@ -267,8 +272,12 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     return manifest["content"]
 
 
-def _unreadable(path: Path, error: Exception) -> CheckpointError:
-    return CheckpointError(f"cannot read checkpoint {path}: {_reason(error)}")
+def _unreadable(path: Path, error: Exception) -> UserError:
+    told = f"cannot read checkpoint {path}: {_reason(error)}"
+    if isinstance(error, OSError) and error.errno not in _MISSING:
+        # It may be whole: nobody should fall back from it.
+        return UserError(f"{told}; make it readable, and give the command again")
+    return CheckpointError(told)
 
 
 def _foreign(path: Path, content: Any, why: str) -> ForeignError:

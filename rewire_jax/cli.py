@@ -202,7 +202,7 @@ def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) ->
         # Drawn with minus signs and bars where the terminal has no better.
         lines = [line.strip("│| ") for line in box.getvalue().splitlines()[1:]]
         parts = itertools.groupby(lines, lambda line: bool(line.strip("─╰╯-+")))
-        said, hint, *_ = [*(" ".join(part) for text, part in parts if text), ""]
+        said, hint, *_ = [*(" ".join(part) for text, part in parts if text), "", ""]
         close = re.findall(r"--[a-z-]+", hint) if hint.startswith("Perhaps") else []
         meant = f"; perhaps you meant {' or '.join(close)}" if close else ""
         said = " ".join(said.split()).rstrip(".")
@@ -336,7 +336,8 @@ def _evaluate(arguments: Sequence[str]) -> None:
 
 def _render(arguments: Sequence[str]) -> None:
     made = rendering.render(**vars(parse(Render, "render", arguments)))
-    print(made.title, made.caption, made.page, made.gif or made.note, sep="\n")
+    lines = made.title, made.caption, made.page, made.gif or made.note
+    print(*filter(None, lines), sep="\n")
 
 
 def _report(arguments: Sequence[str]) -> None:
@@ -430,7 +431,7 @@ def _stoppable() -> Iterator[None]:
             # A live display has hidden the cursor.
             Console(stderr=True).show_cursor()
             print(
-                "stopped at once: what was saved stays; --resume goes on from there",
+                "stopped at once: what was saved stays; training goes on with --resume",
                 file=sys.stderr,
                 flush=True,
             )

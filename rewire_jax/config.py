@@ -217,7 +217,8 @@ def check_kinds(group: Any) -> None:
                 most = _AT_MOST.get(name, _LARGEST - 1)
                 require(value <= most, f"{flag(name)} must be at most {most}, {told}")
             if kind is float:
-                small = not math.isfinite(value) or abs(value) < _LARGEST_FLOAT
+                # NaN and infinity are told of elsewhere. Large ints are no floats.
+                small = not _LARGEST_FLOAT <= abs(value) < math.inf
                 require(small, f"{flag(name)} is too large for a 32-bit float: {value}")
 
 

@@ -53,7 +53,8 @@ def gaze(film: Film) -> tuple[Array, float]:
 
     It follows what walks away, in the plane, and rests on what stays.
     """
-    some = movable(film)
+    moving = movable(film)
+    some = moving if len(moving) else solids(film)
     centre = film.position[:, some].mean(axis=1)
     reach = np.linalg.norm(film.position[0, some] - centre[0], axis=1)
     size = float((reach + film.model.geom_rbound[some]).max())

@@ -109,8 +109,7 @@ def prepare(
     scenario = scenario or make_scenario(
         settings.scenario, settings.backend, settings.reward
     )
-    for name in ("scenario", "backend"):
-        made = {"scenario": scenario.name, "backend": scenario.backend}[name]
+    for name, made in (("scenario", scenario.name), ("backend", scenario.backend)):
         given = getattr(settings, name)
         require(
             given == made, f"{config.flag(name)} {given}: the run is on {made}; drop it"

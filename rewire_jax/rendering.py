@@ -113,12 +113,13 @@ def render(
     from rewire_jax import animation, webpage
 
     runfolder.make(page.parent)
+    gif = page.with_suffix(".gif")
     with writing(page):
-        page.write_text(webpage.to_html(played.film, title, caption))
+        page.write_text(webpage.to_html(played.film, title, caption), encoding="utf-8")
+        gif.unlink(missing_ok=True)  # that of another episode
     rendered = Rendered(title, caption, returns, steps, page)
     if not seconds:
         return rendered
-    gif = page.with_suffix(".gif")
     try:
         animation.write_gif(played.film, gif, seconds=seconds)
     except UserError as error:

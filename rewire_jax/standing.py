@@ -214,9 +214,12 @@ def _facts(path: Path) -> dict[str, Any]:
       CheckpointError: it is not that of a run, or it is another than its name says.
     """
     facts = checkpoint.read_metadata(path)
-    with reading(path):
-        name = _name(facts["stage"], facts["steps"])
-        list(facts["items"]), dict(facts["tables"])
+    try:
+        with reading(path):
+            name = _name(facts["stage"], facts["steps"])
+            list(facts["items"]), dict(facts["tables"])
+    except UserError as error:
+        raise checkpoint.CheckpointError(str(error)) from error
     if path.name != name:
         raise checkpoint.CheckpointError(f"checkpoint {path} was written as {name}")
     return facts

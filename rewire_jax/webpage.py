@@ -34,7 +34,7 @@ def to_html(film: Film, title: str, caption: str) -> str:
       title: plain text.
       caption: plain text.
     """
-    player = Template(_PLAYER.read_text()).substitute(
+    player = Template(_PLAYER.read_text(encoding="utf-8")).substitute(
         title=html.escape(title),
         caption=html.escape(caption),
         film=json.dumps(to_json(film), separators=(",", ":")),

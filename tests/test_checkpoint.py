@@ -195,6 +195,30 @@ def test_damage_is_told_in_one_line(saved: Path, damage: Any, says: str) -> None
     assert "\n" not in str(caught.value)
 
 
+def test_what_may_be_whole_is_not_called_damaged(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Who falls back from a damaged checkpoint deletes what was made since.
+    def failing(error: Exception) -> Any:
+        def read(*_: Any) -> Any:
+            raise error
+
+        return read
+
+    locked = PermissionError(errno.EACCES, "Permission denied", "x")
+    monkeypatch.setattr(checkpoint, "_read_item", failing(locked))
+    with pytest.raises(UserError, match=r"Permission denied.*readable") as caught:
+        load(saved, POLICY)
+    assert not isinstance(caught.value, CheckpointError)
+    monkeypatch.setattr(checkpoint, "_read_item", failing(MemoryError()))
+    with pytest.raises(MemoryError):
+        load(saved, POLICY)
+    gone = FileNotFoundError(errno.ENOENT, "No such file", "x")
+    monkeypatch.setattr(checkpoint, "_read_item", failing(gone))
+    with pytest.raises(CheckpointError):
+        load(saved, POLICY)
+
+
 def test_another_format_names_the_version(saved: Path) -> None:
     change_manifest(saved, '"format": 1', '"format": 9')
     change_manifest(saved, f'"version": "{__version__}"', '"version": "9.8"')

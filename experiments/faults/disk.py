@@ -133,7 +133,8 @@ def full_cache(size: int, place: Path) -> Outcome:
             base.run(*TRAIN, "--cache", disk / "cache", "--out", each)
             for each in (place / "first", folder)
         ]
-    return _went_on(ran[1], folder, whole)
+    outcome = _went_on(ran[1], folder, whole)
+    return outcome._replace(wrong=base.first(base.failed(ran[0]), outcome.wrong))
 
 
 def _went_on(ran: base.Ran, folder: Path, whole: Path) -> Outcome:

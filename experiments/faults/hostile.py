@@ -145,9 +145,9 @@ def _write(path: Path, manifest: dict[str, Any]) -> None:
     path.write_text(json.dumps(manifest))
 
 
-def _header(at: str, value: Any, **others: Any) -> Trap:
+def _header(at: str, value: Any) -> Trap:
     name = f"{at}: {value!r:.20}"
-    return Trap(name, partial(header, at=at, value=value), **others)
+    return Trap(name, partial(header, at=at, value=value))
 
 
 _DEEP = "[" * 100_000
@@ -202,6 +202,7 @@ VALUES = (
     _header("settings.sac.hidden", 10**400),
     _header("settings.sac.depth", _HUGE),
     _header("settings.sac.discount", float("inf")),
+    _header("settings.sac.discount", 10**400),
     _header("settings.seeds", _HUGE),
     _header("settings.options.modes", _HUGE),
     _header("settings", "probe/reach"),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import rewire_jax
-from experiments.faults import base, kills
+from experiments.faults import base, damage
 from experiments.faults.base import TRAIN, Case, Kind, Outcome
 from rewire_jax.runfolder import HEADER, TABLES
 
@@ -144,17 +144,10 @@ def older(changes: tuple[Change, ...], half: bool, place: Path) -> Outcome:
       place: a new folder.
     """
     whole, folder = base.unbroken(place, *TRAIN), place / "run"
-    if half:
-        name = "task-001-step-0000020"
-        moment = kills.Moment(name, partial(kills.kept, name), 0.0)
-        words = [*base.words(TRAIN), "--out", str(folder)]
-        wrong = kills.kill(words, folder, moment)
-    else:
-        wrong = ""
-        shutil.copytree(whole, folder)
+    shutil.copytree(damage.halfway(place) if half else whole, folder)
     for change in changes:
         change(folder)
-    wrong = wrong or works(folder, whole)
+    wrong = works(folder, whole)
     return Outcome("", wrong, base.lost(base.results(whole), folder))
 
 
