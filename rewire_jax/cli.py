@@ -6,6 +6,7 @@ import dataclasses
 import io
 import itertools
 import json
+import logging
 import os
 import re
 import signal
@@ -483,6 +484,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments[0] == "--version":
         print(f"rewire_jax {__version__}")
         return
+    if not debug:
+        # When a write fails, those beside it still report to Orbax, which has gone.
+        sys.unraisablehook = lambda _: None
+        logging.getLogger("asyncio").disabled = True
     name, *rest = arguments
     try:
         known = ", ".join(_COMMANDS)
