@@ -395,7 +395,7 @@ def test_what_is_needed_within_a_task_is_saved(method, overlap, tmp_path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(continual.Run, "chunk", stopping)
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(continual.Stopped):
             continual.train(made, tmp_path / "stopped", scenario=scenario)
     assert list((tmp_path / "stopped" / "checkpoints").glob("task-001-step-*"))
     open_lanes.cache_clear()
