@@ -130,11 +130,18 @@ def _compile(
 
     def draws(member, index, time):
         key, sac = task_keys(member, index)[1], member.sac
+        sequences = None
+        if sac.noise_color:
+            # All that a turn may touch, each drawn once.
+            starts = time + length * jnp.arange((shape.every - 2) // length + 2)
+            sequences = jax.vmap(
+                lambda start: exploring.draw_sequence(key, start, size, length, sac)
+            )(starts)
 
         def of(now):
             sequence = None
-            if sac.noise_color:
-                sequence = exploring.draw_sequence(key, now, size, length, sac)
+            if sequences is not None:
+                sequence = sequences[now // length - time // length]
             collect_key, _ = jax.random.split(jax.random.fold_in(key, now))
             return exploring.draw(collect_key, now, size, shape.random, sequence)
 

@@ -131,14 +131,39 @@ def run(*arguments: str | Path, before: Sequence[str] = (), **others: str) -> Ra
       before: words of a command that runs it.
       others: environment variables.
     """
+    return execute([*before, *words(arguments)], **others)
+
+
+def execute(
+    command: Sequence[str], folder: Path | None = None, /, **others: str
+) -> Ran:
+    """Runs any command, in this folder; otherwise like `run`."""
     done = subprocess.run(
-        [*before, *words(arguments)],
+        command,
         capture_output=True,
         text=True,
+        cwd=folder,
         env=environment() | others,
         check=False,
     )
     return Ran(done.returncode, done.stdout, done.stderr)
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    """Starts `rewire-jax`, to be ended by `end`."""
+    return subprocess.Popen(
+        words(arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment(),
+    )
+
+
+def end(process: subprocess.Popen[str]) -> Ran:
+    """Waits for the end of a command."""
+    out, err = process.communicate()
+    return Ran(process.returncode, out, err)
 
 
 def unbroken(beside: Path, *arguments: str) -> Path:

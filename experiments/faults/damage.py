@@ -18,6 +18,8 @@ _SEED = 11
 _TASKS = SETTINGS["tasks"]
 _EVALUATE = ("--episodes", "4", "--json")
 _MIDDLE = "task-001-step-0000020"
+Change = Callable[[bytes, int, int], bytes]
+"""From what a file holds, a place in it and a bit of a byte, to what it holds then."""
 
 
 def halfway(beside: Path) -> Path:
@@ -25,9 +27,8 @@ def halfway(beside: Path) -> Path:
     folder = beside.parent / "halfway"
     if not folder.exists():
         made = folder.with_suffix(".part")
-        command = [*base.words(TRAIN), "--out", str(made)]
         moment = kills.Moment(_MIDDLE, partial(kills.kept, _MIDDLE), 0.0)
-        wrong = kills.kill(command, made, moment)
+        wrong = kills.kill(made, moment, *TRAIN, "--out", made)
         if wrong:
             raise RuntimeError(wrong)
         made.rename(folder)
@@ -44,9 +45,7 @@ def flip(held: bytes, at: int, bit: int) -> bytes:
     return held[:at] + bytes([held[at] ^ 1 << bit]) + held[at + 1 :]
 
 
-def damage(
-    checkpoint: Path, change: Callable[[bytes, int, int], bytes], number: int
-) -> str:
+def damage(checkpoint: Path, change: Change, number: int) -> str:
     """Changes a file of a checkpoint at a random place; says which."""
     draw = random.Random(f"{_SEED} {change.__name__} {number}")
     files = sorted(f for f in checkpoint.rglob("*") if f.is_file() and f.stat().st_size)
@@ -90,9 +89,7 @@ def refused(folder: Path, whole: Path, stage: int, file: str) -> str:
         return wrong or ("" if file in str(error) else f"it does not say {file}")
 
 
-def middle(
-    change: Callable[[bytes, int, int], bytes], number: int, place: Path
-) -> Outcome:
+def middle(change: Change, number: int, place: Path) -> Outcome:
     """The newest checkpoint of an unfinished run: the one before is taken instead."""
     whole = base.unbroken(place, *TRAIN)
     folder = Path(shutil.copytree(halfway(place), place / "run"))
@@ -101,9 +98,7 @@ def middle(
     return Outcome("", wrong, base.lost(base.results(whole), folder))
 
 
-def finished(
-    change: Callable[[bytes, int, int], bytes], number: int, place: Path
-) -> Outcome:
+def finished(change: Change, number: int, place: Path) -> Outcome:
     """What is kept of a task: deleted as the line says, it is trained again."""
     whole = base.unbroken(place, *TRAIN)
     folder = Path(shutil.copytree(whole, place / "run"))
@@ -120,9 +115,7 @@ def finished(
     return Outcome("", wrong, base.lost(base.results(whole), folder))
 
 
-def sweep(
-    change: Callable[[bytes, int, int], bytes], number: int, place: Path
-) -> Outcome:
+def sweep(change: Change, number: int, place: Path) -> Outcome:
     """What a sweep's next task begins from: deleted as told, it is trained again."""
     whole = base.unbroken(place, *SWEEP)
     folder = Path(shutil.copytree(whole, place / "sweep"))

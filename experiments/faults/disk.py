@@ -74,17 +74,10 @@ def filled(moment: Moment, place: Path) -> Outcome:
     whole = base.unbroken(place, *TRAIN)
     with small_disk(place / "disk", _ROOM) as disk:
         folder = disk / "run"
-        process = subprocess.Popen(
-            [*base.words(TRAIN), "--out", str(folder)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=base.environment(),
-        )
+        process = base.start(*TRAIN, "--out", folder)
         kills.wait(process, folder, moment)
         fill(disk)
-        _, said = process.communicate()
-        return after(base.Ran(process.returncode, "", said), disk, folder, whole)
+        return after(base.end(process), disk, folder, whole)
 
 
 def after(ran: base.Ran, disk: Path, folder: Path, whole: Path) -> Outcome:

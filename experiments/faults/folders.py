@@ -3,7 +3,6 @@
 import shutil
 import signal
 import socket
-import subprocess
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,31 +14,14 @@ from experiments.faults.kills import SWEEP, Moment
 _RESUME = ("--resume",)
 
 
-def start(*arguments: str | Path) -> subprocess.Popen[str]:
-    """Starts a command, to be ended by `end`."""
-    return subprocess.Popen(
-        base.words(arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=base.environment(),
-    )
-
-
-def end(process: subprocess.Popen[str]) -> Ran:
-    """Waits for the end of a command."""
-    out, err = process.communicate()
-    return Ran(process.returncode, out, err)
-
-
 def together(*arguments: str | Path) -> list[Ran]:
     """Two processes that share a sweep, as one command of theirs each starts them."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     words = [*arguments, "--coordinator", address, "--processes", "2"]
-    pair = [start(*words, "--process", str(number)) for number in range(2)]
-    return [end(process) for process in pair]
+    pair = [base.start(*words, "--process", str(number)) for number in range(2)]
+    return [base.end(process) for process in pair]
 
 
 def alone(*arguments: str | Path) -> list[Ran]:
@@ -64,7 +46,7 @@ def during(
       place: a new folder.
     """
     whole, folder = base.unbroken(place, *arguments), place / "run"
-    process = start(*arguments, "--out", folder)
+    process = base.start(*arguments, "--out", folder)
     begun = Moment("report 2", partial(kills.rows, "training.jsonl", 4), 0.0)
     kills.wait(process, folder / inside, begun)
     # It must not end before the second has looked.
@@ -75,7 +57,7 @@ def during(
         others[0].said,
         base.first(
             *(base.complaint(ran, str(folder), "--out") for ran in others),
-            base.failed(end(process)),
+            base.failed(base.end(process)),
             base.different(folder, whole),
         ),
         base.lost(base.results(whole), folder),
@@ -85,8 +67,8 @@ def during(
 def at_once(arguments: Sequence[str], place: Path) -> Outcome:
     """The same command twice at the same time: one of them has the folder."""
     whole, folder = base.unbroken(place, *arguments), place / "run"
-    pair = [start(*arguments, "--out", folder) for _ in range(2)]
-    ran = sorted(end(process) for process in pair)
+    pair = [base.start(*arguments, "--out", folder) for _ in range(2)]
+    ran = sorted(base.end(process) for process in pair)
     return Outcome(
         ran[1].said,
         base.first(
@@ -118,8 +100,8 @@ def again(
     wrong = ""
     if stopped:
         seen = partial(kills.reached, "task-001-step-0000020")
-        words = [*base.words(arguments), "--out", str(folder)]
-        wrong = kills.kill(words, folder / inside, Moment("a checkpoint", seen, 0.05))
+        moment = Moment("a checkpoint", seen, 0.05)
+        wrong = kills.kill(folder / inside, moment, *arguments, "--out", folder)
     else:
         shutil.copytree(whole, folder)
     before = base.contents(folder)

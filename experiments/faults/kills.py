@@ -104,20 +104,14 @@ def wait(process: subprocess.Popen[str], watched: Path, moment: Moment) -> None:
         time.sleep(0.0005)
 
 
-def kill(words: Sequence[str], watched: Path, moment: Moment) -> str:
-    """Runs a command and kills it; says so if it ended before, else ""."""
-    process = subprocess.Popen(
-        words,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=base.environment(),
-    )
+def kill(watched: Path, moment: Moment, *arguments: str | Path) -> str:
+    """Runs `rewire-jax` and kills it; says so if it ended before, else ""."""
+    process = base.start(*arguments)
     wait(process, watched, moment)
     process.kill()
-    _, said = process.communicate()
-    ended = process.returncode != -signal.SIGKILL
-    return f"it ended before {moment.name}: {said}" if ended else ""
+    ran = base.end(process)
+    ended = ran.status != -signal.SIGKILL
+    return f"it ended before {moment.name}: {ran.err}" if ended else ""
 
 
 def state(folder: Path) -> str:
@@ -141,10 +135,11 @@ def killed(
     """
     whole = base.unbroken(place, *arguments)
     folder, wrong, left = place / "run", "", []
-    command = [*base.words(arguments), "--out", str(folder)]
     for number, moment in enumerate(some):
-        resume = ["--resume"] if number else []
-        wrong = wrong or kill([*command, *resume], folder / inside, moment)
+        resume = ("--resume",) if number else ()
+        wrong = wrong or kill(
+            folder / inside, moment, *arguments, *resume, "--out", folder
+        )
         left.append(state(folder))
     resumed = base.run(*arguments, "--out", folder, "--resume")
     return Outcome(

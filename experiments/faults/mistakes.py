@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import random
-import subprocess
 import sys
 import typing
 from collections.abc import Callable, Iterator, Sequence
@@ -210,14 +209,8 @@ def made(mistake: Mistake, place: Path) -> Outcome:
     out, cache = place / "out", place / "cache"
     words = [word.format(out=out) for word in mistake.words]
     if words[0] == "-c":
-        done = subprocess.run(
-            [sys.executable, "-c", _CALL, *words[1:]],
-            capture_output=True,
-            text=True,
-            env=base.environment() | {"JAX_COMPILATION_CACHE_DIR": str(cache)},
-            check=False,
-        )
-        ran = base.Ran(done.returncode, done.stdout, done.stderr)
+        command = [sys.executable, "-c", _CALL, *words[1:]]
+        ran = base.execute(command, JAX_COMPILATION_CACHE_DIR=str(cache))
         wrong = base.complaint(ran, mistake.named, status=1)
     else:
         ran = base.run(*words, "--cache", cache)

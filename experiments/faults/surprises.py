@@ -1,12 +1,11 @@
 """What nobody has thought of: errors that no command expects."""
 
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
 
 from experiments.faults import base
-from experiments.faults.base import Case, Kind, Outcome, Ran
+from experiments.faults.base import Case, Kind, Outcome
 from rewire_jax import cli
 
 _BROKEN = """
@@ -23,19 +22,9 @@ cli.main()
 
 def surprised(command: str, place: Path) -> Outcome:
     """A command fails in a way of its own: in one line, and --debug says where."""
+    words = [sys.executable, "-c", _BROKEN, command]
     ran, debugged = (
-        Ran(done.returncode, done.stdout, done.stderr)
-        for done in (
-            subprocess.run(
-                [sys.executable, "-c", _BROKEN, command, *more],
-                capture_output=True,
-                text=True,
-                env=base.environment(),
-                cwd=place,
-                check=False,
-            )
-            for more in ((), ("--debug",))
-        )
+        base.execute([*words, *more], place) for more in ((), ("--debug",))
     )
     told = "Traceback" in debugged.err and "in broken" in debugged.err
     return Outcome(
