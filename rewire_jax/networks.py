@@ -45,8 +45,29 @@ def activate(x: jax.Array) -> jax.Array:
 
 def affine(layer: Linear, x: jax.Array) -> jax.Array:
     """`[..., inputs]` -> `[..., outputs]`."""
-    contract_inputs = (((x.ndim - 1,), (1,)), ((), ()))
-    return jax.lax.dot_general(x, layer.weight, contract_inputs) + layer.bias
+    return _product(x, layer.weight) + layer.bias
+
+
+@jax.custom_vjp
+def _product(x, weight):
+    return jax.lax.dot_general(x, weight, (((x.ndim - 1,), (1,)), ((), ())))
+
+
+def _product_forward(x, weight):
+    return _product(x, weight), (x, weight)
+
+
+def _product_backward(residuals, gradient):
+    x, weight = residuals
+    columns = gradient.reshape(-1, weight.shape[0]).T
+    if jax.default_backend() == "cpu":
+        # Else the transposition becomes a part of the product, and XLA leaves such a
+        # one to a library that takes a third longer.
+        columns = jax.lax.optimization_barrier(columns)
+    return gradient @ weight, columns @ x.reshape(-1, weight.shape[1])
+
+
+_product.defvjp(_product_forward, _product_backward)
 
 
 def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:

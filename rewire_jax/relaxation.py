@@ -21,7 +21,6 @@ def score_gradient(
     ordered: jax.Array,
     tau: jax.Array,
     block: int,
-    axis: int = 0,
 ) -> jax.Array:
     """Gradient of sum(Q * A) in the sorted scores, A[i, j] = <gradient_i, permuted_j>.
 
@@ -34,8 +33,6 @@ def score_gradient(
       ordered: `[n]`, ascending.
       tau: `[]`, temperature.
       block: places in a block; if n or more, there is one with all.
-      axis: 1 for arrays `[m, n]`: XLA takes longer to transpose them than for all
-        else.
 
     Returns:
       `[n]`.
@@ -45,29 +42,22 @@ def score_gradient(
     block = -(-n // blocks)
     surplus = blocks * block - n
 
-    def cut(x, axis=0, mode="constant"):
+    def cut(x, mode="constant"):
         if surplus:
-            widths = [(0, 0)] * x.ndim
-            widths[axis] = (0, surplus)
-            x = jnp.pad(x, widths, mode)
-        if axis == 0:
-            return x.reshape(blocks, block, -1)
-        return x.reshape(-1, blocks, block).swapaxes(0, 1)
+            x = jnp.pad(x, [(0, surplus)] + [(0, 0)] * (x.ndim - 1), mode)
+        return x.reshape(blocks, block, -1)
 
-    pairs = [
-        (cut(g, axis), cut(x, axis)) for g, x in zip(gradients, permuted, strict=True)
-    ]
-    i, j = ("bim", "bjm") if axis == 0 else ("bmi", "bmj")
-    s, real = cut(ordered, mode="edge"), cut(jnp.ones_like(ordered))
+    pairs = list(zip(map(cut, gradients), map(cut, permuted), strict=True))
+    s, real = cut(ordered, "edge"), cut(jnp.ones_like(ordered))
     difference = s - s.mT
     near = jnp.exp(-jnp.abs(difference) / tau) * real.mT
     # At ties the sign is +1, JAX's own derivative of abs at 0.
     signed = jnp.where(difference >= 0, near, -near)
-    product = sum(jnp.einsum(f"{i},{j}->bij", g, x) for g, x in pairs)
+    product = sum(jnp.einsum("bim,bjm->bij", g, x) for g, x in pairs)
     rows, columns = _sides(s[..., 0], tau)
 
     ones = _far(rows, real).mT
-    inner = _meet(((g, _far(rows, x, i)) for g, x in pairs), i)
+    inner = _meet((g, _far(rows, x)) for g, x in pairs)
     lift = jnp.abs(rows.lift[..., :2])
     norm = jnp.sum(near, 2) + jnp.sum(lift * ones[..., :2], 2)
     # The product with ones is a sum, and quicker on a CPU.
@@ -79,7 +69,7 @@ def score_gradient(
     as_row = jnp.sum(slope, 2) + rate[..., 0] * jnp.sum(inner, 2)
 
     columns = columns._replace(decay=columns.decay * rate.mT)
-    inner = _meet(((x, _far(columns, g, i)) for g, x in pairs), i)
+    inner = _meet((x, _far(columns, g)) for g, x in pairs)
     inner = columns.lift * (inner - _far(columns, centre).mT)
     as_column = jnp.sum(slope, 1) + jnp.sum(inner, 2)
     return (as_column - as_row).reshape(-1)[:n]
@@ -127,12 +117,12 @@ def _sides(s, tau):
     )
 
 
-def _far(side, x, axes="bim"):
+def _far(side, x):
     """`[blocks, 3, m]`: what reaches each block from the others of x."""
-    edge = jnp.einsum(f"bti,{axes}->btm", side.decay, x)
+    edge = jnp.einsum("bti,bim->btm", side.decay, x)
     return jnp.einsum("tab,btm->atm", side.gap, edge)
 
 
-def _meet(pairs, axes):
+def _meet(pairs):
     """`[blocks, block, 3]`: products of places with what reaches their block."""
-    return sum(jnp.einsum(f"{axes},btm->bit", here, far) for here, far in pairs)
+    return sum(jnp.einsum("bim,btm->bit", here, far) for here, far in pairs)

@@ -77,7 +77,8 @@ def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
       action: `[batch, actions]`.
     """
     inputs = jnp.concatenate([inputs, action], axis=-1)
-    return jax.vmap(networks.mlp, (0, None))(critic, inputs)[..., 0]
+    # Of one input for both, XLA would make one product, then transpose it in two.
+    return jax.vmap(networks.mlp)(critic, jnp.stack([inputs, inputs]))[..., 0]
 
 
 class Draw(NamedTuple):
