@@ -46,10 +46,10 @@ def _forward(x, scores, tau):
 
 def _backward(residuals, gradient):
     permuted, order, scores, tau = residuals
-    rows, values = (x.reshape(-1, order.shape[0]).T for x in (gradient, permuted))
+    flat, values = (x.reshape(-1, order.shape[0]) for x in (gradient, permuted))
     return (
         _take_last(gradient, _invert(order)),
-        _score_gradient([rows], [values], order, scores, tau),
+        _score_gradient([flat], [values], order, scores, tau, axis=1),
         jnp.zeros_like(tau),
     )
 
@@ -129,7 +129,7 @@ def _invert(order):
     return _put(jnp.arange(order.shape[0], dtype=order.dtype), order)
 
 
-def _score_gradient(gradients, permuted, order, scores, tau):
+def _score_gradient(gradients, permuted, order, scores, tau, axis=0):
     """Gradient in the scores, from the sorted ones: only n results are moved."""
     wide = jnp.promote_types(permuted[0].dtype, jnp.float32)
     in_sorted = score_gradient(
@@ -138,6 +138,7 @@ def _score_gradient(gradients, permuted, order, scores, tau):
         scores[order].astype(wide),
         jnp.asarray(tau, wide),
         _block(scores.shape[0]),
+        axis,
     )
     return in_sorted[_invert(order)].astype(scores.dtype)
 

@@ -21,6 +21,7 @@ def score_gradient(
     ordered: jax.Array,
     tau: jax.Array,
     block: int,
+    axis: int = 0,
 ) -> jax.Array:
     """Gradient of sum(Q * A) in the sorted scores, A[i, j] = <gradient_i, permuted_j>.
 
@@ -33,6 +34,8 @@ def score_gradient(
       ordered: `[n]`, ascending.
       tau: `[]`, temperature.
       block: places in a block; if n or more, there is one with all.
+      axis: 1 for arrays `[m, n]`: to transpose large ones would take XLA longer than
+        all else.
 
     Returns:
       `[n]`.
@@ -42,22 +45,29 @@ def score_gradient(
     block = -(-n // blocks)
     surplus = blocks * block - n
 
-    def cut(x, mode="constant"):
+    def cut(x, axis=0, mode="constant"):
         if surplus:
-            x = jnp.pad(x, [(0, surplus)] + [(0, 0)] * (x.ndim - 1), mode)
-        return x.reshape(blocks, block, -1)
+            widths = [(0, 0)] * x.ndim
+            widths[axis] = (0, surplus)
+            x = jnp.pad(x, widths, mode)
+        if axis == 0:
+            return x.reshape(blocks, block, -1)
+        return x.reshape(-1, blocks, block).swapaxes(0, 1)
 
-    pairs = list(zip(map(cut, gradients), map(cut, permuted), strict=True))
-    s, real = cut(ordered, "edge"), cut(jnp.ones_like(ordered))
+    pairs = [
+        (cut(g, axis), cut(x, axis)) for g, x in zip(gradients, permuted, strict=True)
+    ]
+    i, j = ("bim", "bjm") if axis == 0 else ("bmi", "bmj")
+    s, real = cut(ordered, mode="edge"), cut(jnp.ones_like(ordered))
     difference = s - s.mT
     near = jnp.exp(-jnp.abs(difference) / tau) * real.mT
     # At ties the sign is +1, JAX's own derivative of abs at 0.
     signed = jnp.where(difference >= 0, near, -near)
-    product = sum(jnp.einsum("bim,bjm->bij", g, x) for g, x in pairs)
+    product = sum(jnp.einsum(f"{i},{j}->bij", g, x) for g, x in pairs)
     rows, columns = _sides(s[..., 0], tau)
 
     ones = _far(rows, real).mT
-    inner = _meet((g, _far(rows, x)) for g, x in pairs)
+    inner = _meet(((g, _far(rows, x, i)) for g, x in pairs), i)
     lift = jnp.abs(rows.lift[..., :2])
     norm = jnp.sum(near, 2) + jnp.sum(lift * ones[..., :2], 2)
     # The product with ones is a sum, and quicker on a CPU.
@@ -69,7 +79,7 @@ def score_gradient(
     as_row = jnp.sum(slope, 2) + rate[..., 0] * jnp.sum(inner, 2)
 
     columns = columns._replace(decay=columns.decay * rate.mT)
-    inner = _meet((x, _far(columns, g)) for g, x in pairs)
+    inner = _meet(((x, _far(columns, g, i)) for g, x in pairs), i)
     inner = columns.lift * (inner - _far(columns, centre).mT)
     as_column = jnp.sum(slope, 1) + jnp.sum(inner, 2)
     return (as_column - as_row).reshape(-1)[:n]
@@ -117,12 +127,12 @@ def _sides(s, tau):
     )
 
 
-def _far(side, x):
+def _far(side, x, axes="bim"):
     """`[blocks, 3, m]`: what reaches each block from the others of x."""
-    edge = jnp.einsum("bti,bim->btm", side.decay, x)
+    edge = jnp.einsum(f"bti,{axes}->btm", side.decay, x)
     return jnp.einsum("tab,btm->atm", side.gap, edge)
 
 
-def _meet(pairs):
+def _meet(pairs, axes):
     """`[blocks, block, 3]`: products of places with what reaches their block."""
-    return sum(jnp.einsum("bim,btm->bit", here, far) for here, far in pairs)
+    return sum(jnp.einsum(f"btm,{axes}->bti", far, here).mT for here, far in pairs)

@@ -64,6 +64,10 @@ def test_equals_the_dense_form_whatever_the_blocks(n, double):
         ours = functools.partial(score_gradient, block=block)
         got = over_kinds_and_temperatures(ours, gradients, permuted)(scores, taus)
         assert np.max(np.abs(got - expected) / size[..., None]) < 1e-10
+        turned = [[a.T for a in arrays] for arrays in (gradients, permuted)]
+        ours = functools.partial(score_gradient, block=block, axis=1)
+        got = over_kinds_and_temperatures(ours, *turned)(scores, taus)
+        assert np.max(np.abs(got - expected) / size[..., None]) < 1e-10
     # The comparison can fail: all but the last kind have something to learn.
     if n > 2:
         assert np.all(np.max(np.abs(expected), axis=-1)[:-1, 0] > 1e-4 * terms)
