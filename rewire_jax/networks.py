@@ -48,26 +48,25 @@ def affine(layer: Linear, x: jax.Array) -> jax.Array:
     return _product(x, layer.weight) + layer.bias
 
 
-@jax.custom_vjp
-def _product(x, weight):
-    return jax.lax.dot_general(x, weight, (((x.ndim - 1,), (1,)), ((), ())))
+def _dot(x, y):
+    """Products over the last axis of both, x yᵀ."""
+    return jax.lax.dot_general(x, y, (((x.ndim - 1,), (1,)), ((), ())))
 
 
-def _product_forward(x, weight):
-    return _product(x, weight), (x, weight)
+_product = jax.custom_jvp(_dot)
 
 
-def _product_backward(residuals, gradient):
-    x, weight = residuals
-    columns = gradient.reshape(-1, weight.shape[0]).T
+@_product.defjvp
+def _product_jvp(primals, tangents):
+    (x, weight), (by_x, by_weight) = primals, tangents
+    # Its transpose, the weight's gradient, begins with that of the output transposed.
+    turned = _dot(by_weight, x.reshape(-1, x.shape[-1]))
     if jax.default_backend() == "cpu":
-        # Else the transposition becomes a part of the product, and XLA leaves such a
-        # one to a library that takes a third longer.
-        columns = jax.lax.optimization_barrier(columns)
-    return gradient @ weight, columns @ x.reshape(-1, weight.shape[1])
-
-
-_product.defvjp(_product_forward, _product_backward)
+        # Else XLA makes that a part of the product, and leaves such a one to a library
+        # that takes a third longer.
+        turned = jax.lax.optimization_barrier(turned)
+    value = _dot(x, weight)
+    return value, _dot(by_x, weight) + turned.T.reshape(value.shape)
 
 
 def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:

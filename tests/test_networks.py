@@ -49,6 +49,34 @@ def test_mlp_is_affine_layers_with_leaky_relu_between():
     )
 
 
+def test_derivatives_are_those_of_plain_products():
+    # The layers have a derivative rule of their own, forwards and backwards.
+    layers = networks.init_mlp(jax.random.key(0), [3, 8, 8, 2])
+    x = jax.random.normal(jax.random.key(1), (5, 4, 3))
+
+    def plain(layers, x):
+        for weight, bias in layers[:-1]:
+            x = networks.activate(x @ weight.T + bias)
+        return x @ layers[-1].weight.T + layers[-1].bias
+
+    def derivatives(network):
+        def total(layers, x):
+            return jnp.sum(network(layers, x) ** 2)
+
+        directions = jax.tree.map(jnp.cos, (layers, x))
+        return (
+            jax.grad(total, (0, 1))(layers, x),
+            jax.jvp(network, (layers, x), directions)[1],
+            jax.hessian(total, 1)(layers, x[0, 0]),
+        )
+
+    jax.tree.map(
+        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4),
+        derivatives(networks.mlp),
+        derivatives(plain),
+    )
+
+
 def test_the_policy_splits_and_clips_its_output():
     output = jnp.asarray([[1.0, -30.0, 5.0, -25.0], [0.5, 0.2, -1.0, 2.5]])
     mean, log_std = networks.gaussian(output)
