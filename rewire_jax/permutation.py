@@ -109,8 +109,8 @@ def _order(scores):
     return _take(first, second).astype(jnp.int32)
 
 
-def _take(x, where):
-    return jnp.asarray(x).at[where].get(mode="promise_in_bounds", unique_indices=True)
+def _take(x, order):
+    return jnp.asarray(x).at[order].get(mode="promise_in_bounds", unique_indices=True)
 
 
 def _take_last(x, order):

@@ -67,7 +67,7 @@ def score_gradient(
     rows, columns = _sides(s[..., 0], tau)
 
     ones = _far(rows, real).mT
-    inner = _meet(((g, _far(rows, x, i)) for g, x in pairs), i)
+    inner = _meet(rows, pairs, i)
     lift = jnp.abs(rows.lift[..., :2])
     norm = jnp.sum(near, 2) + jnp.sum(lift * ones[..., :2], 2)
     # The product with ones is a sum, and quicker on a CPU.
@@ -79,7 +79,7 @@ def score_gradient(
     as_row = jnp.sum(slope, 2) + rate[..., 0] * jnp.sum(inner, 2)
 
     columns = columns._replace(decay=columns.decay * rate.mT)
-    inner = _meet(((x, _far(columns, g, i)) for g, x in pairs), i)
+    inner = _meet(columns, [(x, g) for g, x in pairs], i)
     inner = columns.lift * (inner - _far(columns, centre).mT)
     as_column = jnp.sum(slope, 1) + jnp.sum(inner, 2)
     return (as_column - as_row).reshape(-1)[:n]
@@ -133,6 +133,9 @@ def _far(side, x, axes="bim"):
     return jnp.einsum("tab,btm->atm", side.gap, edge)
 
 
-def _meet(pairs, axes):
+def _meet(side, pairs, axes):
     """`[blocks, block, 3]`: products of places with what reaches their block."""
-    return sum(jnp.einsum(f"btm,{axes}->bti", far, here).mT for here, far in pairs)
+    return sum(
+        jnp.einsum(f"btm,{axes}->bti", _far(side, there, axes), here).mT
+        for here, there in pairs
+    )
