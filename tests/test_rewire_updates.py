@@ -1,0 +1,369 @@
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rewire_jax.methods import rewire as rewiring
+from rewire_jax.methods import wiring
+from rewire_jax.methods.rewire import Context, RewireSettings, gaussian_kl
+from tests.rewired import (
+    ACTIONS,
+    DEPTH,
+    FLAT,
+    KEY,
+    OBSERVATION,
+    OBSERVATIONS,
+    QUIET,
+    SLOTS,
+    SPEC,
+    K,
+    N,
+    after_tasks,
+    assert_near,
+    assert_same,
+    head_at,
+    make,
+    orders_of,
+    play,
+    trained,
+)
+
+# The forward pass
+
+
+def test_distribution_is_the_wired_network_of_the_mode():
+    method, rng = make(), np.random.default_rng(1)
+    params, memory = after_tasks(method, 2, rng)
+    params, memory = method.start_task(KEY, params, memory, 2)
+    params = trained(rng, params)
+    noise = rng.normal(size=(DEPTH, N)).astype(np.float32)
+    for mode in range(K):
+        for added in (QUIET, noise):
+            got = method.distribution(
+                params, memory, Context(mode, 0, added, KEY), OBSERVATION
+            )
+            orders = orders_of(params.scores[mode] + added)
+            assert_near(got, play(params.hidden, orders, head_at(params, 2)))
+
+
+def test_distribution_takes_any_batch():
+    method = make()
+    params, memory = method.init(KEY)
+    context = Context(0, 0, QUIET, KEY)
+    whole = method.distribution(params, memory, context, OBSERVATION)
+    one = method.distribution(params, memory, context, OBSERVATION[0])
+    assert_near(one, (whole[0][0], whole[1][0]))
+
+
+@pytest.mark.parametrize("rate", ["step", "gradient"])
+def test_only_the_mode_in_use_learns_in_all_layers(rate):
+    # By the dense straight-through form, with the gradient times K if asked.
+    params, memory = make().init(KEY)
+    params = jax.tree.map(jnp.asarray, trained(np.random.default_rng(2), params))
+
+    def ours(scores, tau):
+        options = RewireSettings(head_slots=SLOTS, mode_rate=rate, tau=tau)
+        method = rewiring.rewire(SPEC, dataclasses.replace(options, mode_slots=K))
+        context = Context(1, 0, QUIET, KEY)
+        mean, log_std = method.distribution(
+            params._replace(scores=scores), memory, context, OBSERVATION
+        )
+        return jnp.sum(jnp.sin(mean) + log_std**2)
+
+    def dense(scores):
+        x = OBSERVATION
+        for (weight, bias), v in zip(params.hidden, scores[1], strict=True):
+            difference = jnp.sort(v)[:, None] - v[None, :]
+            soft = jax.nn.softmax(-jnp.abs(difference) / 0.5, axis=-1)
+            hard = jnp.eye(N)[jnp.argsort(v)]
+            x = (x @ weight.T + bias) @ (hard + soft - jax.lax.stop_gradient(soft)).T
+            x = jnp.where(x > 0, x, 0.2 * x)
+        output = x @ params.heads.weight[0].T + params.heads.bias[0]
+        mean, log_std = output[:, :ACTIONS], output[:, ACTIONS:]
+        return jnp.sum(jnp.sin(mean) + log_std**2)
+
+    value, got = jax.jit(jax.value_and_grad(ours))(params.scores, 0.5)
+    expected_value, expected = jax.jit(jax.value_and_grad(dense))(params.scores)
+    if rate == "gradient":
+        expected *= K
+    size = np.max(np.abs(expected))
+    np.testing.assert_allclose(value, expected_value, rtol=1e-4)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-4 * size)
+    used = np.max(np.abs(got), axis=-1) > 1e-3 * size
+    np.testing.assert_array_equal(used, np.arange(K)[:, None] == [1] * DEPTH)
+
+
+def test_gradient_scaling_leaves_close_scores_in_order():
+    params, memory = make().init(KEY)
+    close = np.float32(0.3) + np.float32(2**-24) * np.arange(N, dtype=np.float32)
+    scores = np.random.default_rng(3).permuted(np.tile(close, (K, DEPTH, 1)), axis=-1)
+    params = params._replace(scores=scores)
+    context = Context(2, 0, QUIET, KEY)
+    assert_same(
+        *(
+            make(mode_rate=rate).distribution(params, memory, context, OBSERVATION)
+            for rate in ("step", "gradient")
+        )
+    )
+
+
+@pytest.mark.parametrize(("rate", "factor"), [("step", K), ("gradient", 1)])
+def test_updates_are_scaled_after_the_optimiser(rate, factor):
+    params, memory = make().init(KEY)
+    updates = jax.tree.map(jnp.ones_like, params)
+    got = make(mode_rate=rate).adjust_updates(updates, memory)
+    assert_same(got, updates._replace(scores=factor * updates.scores))
+    got = make(mode_rate=rate, adapter_rate=0.5).adjust_updates(updates, memory)
+    expected = updates._replace(
+        adapters=jax.tree.map(lambda u: 0.5 * u, updates.adapters),
+        scores=factor * updates.scores,
+    )
+    assert_same(got, expected)
+
+
+# Contexts
+
+
+@functools.partial(jax.jit, static_argnames=("number", "purpose"))
+def contexts(options, number, purpose):
+    method = rewiring.rewire(SPEC, options)
+    _, memory = method.init(KEY)
+    draw = jax.vmap(lambda key: method.context(key, memory, purpose, ()))
+    return draw(jax.random.split(KEY, number))
+
+
+@pytest.mark.parametrize("purpose", ["act", "critic", "policy"])
+def test_modes_are_uniform(purpose):
+    for modes in (1, 3, 4):
+        options = RewireSettings(modes=modes, mode_slots=5)
+        drawn = contexts(options, number=4000, purpose=purpose)
+        assert drawn.mode.shape == (4000,)  # one for all layers
+        counts = np.bincount(drawn.mode, minlength=5)
+        np.testing.assert_array_equal(counts[modes:], 0)
+        error = 5 * np.sqrt(4000 / modes)
+        np.testing.assert_allclose(counts[:modes], 4000 / modes, atol=error)
+        # Every other mode comes up with it, about equally often.
+        others = max(modes - 1, 1)
+        offsets = np.bincount((drawn.other - drawn.mode) % modes, minlength=modes)
+        np.testing.assert_allclose(
+            offsets[-others:], 4000 / others, atol=5 * np.sqrt(4000 / others)
+        )
+
+
+def test_noise_is_gumbel_and_only_in_learning():
+    loud, quiet = (RewireSettings(mode_slots=5, noise=noise) for noise in (0.3, 0.0))
+    assert np.all(np.asarray(contexts(loud, number=4000, purpose="act").noise) == 0)
+    assert np.all(np.asarray(contexts(quiet, number=4000, purpose="policy").noise) == 0)
+    noise = np.float64(contexts(loud, number=4000, purpose="policy").noise)
+    assert noise.shape == (4000, DEPTH, N)
+    # Its distribution function is exp(-exp(-x)).
+    uniform = np.sort(np.exp(-np.exp(-noise.ravel() / 0.3)))
+    even = (np.arange(uniform.size) + 0.5) / uniform.size
+    assert np.max(np.abs(uniform - even)) < 2 / np.sqrt(uniform.size)
+    correlation = np.corrcoef(noise.reshape(4000, -1).T) - np.eye(DEPTH * N)
+    assert np.max(np.abs(correlation)) < 0.1
+
+
+def test_dropout_has_its_rate_and_keeps_the_mean():
+    # One layer, where LeakyReLU passes the factor of a kept neuron through.
+    rate, number = 0.25, 4000
+    method = make(FLAT, dropout=rate)
+    params, memory = method.init(KEY)
+    context = Context(0, 0, np.zeros((1, N), np.float32), jax.random.split(KEY, number))
+    draw = jax.vmap(
+        method.distribution, (None, None, Context(None, None, None, 0), None)
+    )
+    means = np.asarray(draw(params, memory, context, OBSERVATION)[0], np.float64)
+    (weight, bias), head = params.hidden[0], head_at(params, 0)
+    x = OBSERVATION @ weight.T + bias
+    terms = np.where(x > 0, x, 0.2 * x)[:, :, None] * head.weight.T[None, :, :ACTIONS]
+    expected = terms.sum(axis=1) + head.bias[:ACTIONS]
+    variance = rate / (1 - rate) * np.sum(np.square(terms), axis=1)
+    error = np.sqrt(variance / number)
+    assert np.all(np.abs(means.mean(axis=0) - expected) < 5 * error)
+    np.testing.assert_allclose(means.var(axis=0), variance, rtol=0.2)
+    # Every state of a batch has its own mask.
+    same = np.broadcast_to(OBSERVATION[:1], (50, OBSERVATIONS))
+    one = Context(0, 0, np.zeros((1, N), np.float32), KEY)
+    assert np.unique(method.distribution(params, memory, one, same)[0]).size > 50
+
+
+# Distillation
+
+
+def test_kl_against_numerical_integration():
+    grid = np.linspace(-30, 30, 200_001)
+
+    def log_density(mean, log_std):
+        return -0.5 * ((grid - mean) / np.exp(log_std)) ** 2 - log_std
+
+    rng = np.random.default_rng(4)
+    p, q = rng.normal(size=(2, 2, 3, ACTIONS)).astype(np.float32) * 0.5
+    got = gaussian_kl(p, q)
+    assert got.shape == (3,)
+    for row in range(3):
+        expected = 0.0
+        for action in range(ACTIONS):
+            first, second = (log_density(*g[:, row, action]) for g in (p, q))
+            weight = np.exp(first) / np.sum(np.exp(first))
+            expected += np.sum(weight * (first - second))
+        np.testing.assert_allclose(got[row], expected, rtol=1e-4)
+    assert not np.allclose(got, gaussian_kl(q, p), rtol=0.05)
+    np.testing.assert_allclose(gaussian_kl(p, p), 0, atol=1e-6)
+
+
+def test_squares_in_numbers():
+    p = np.array([[25.0, -1.0]]), np.array([[0.5, 0.0]])
+    q = np.array([[22.0, 1.0]]), np.array([[0.0, -1.0]])
+    # The first mean counts as 20: 2² + 2² + 0.5² + 1².
+    np.testing.assert_allclose(rewiring.squared_differences(p, q), [9.25])
+
+
+@jax.jit
+def penalty_and_gradient(options, params, memory, mode, noise):
+    method = rewiring.rewire(SPEC, options)
+
+    def loss(params, other):
+        context = Context(mode, other, noise, KEY)
+        gaussian = method.distribution(params, memory, context, OBSERVATION)
+        return method.penalty(KEY, params, memory, context, OBSERVATION, gaussian)
+
+    both = jax.value_and_grad(loss, has_aux=True)
+    return jax.vmap(both, (None, 0))(params, jnp.arange(K))
+
+
+def penalties(options, params, memory, mode, noise=QUIET):
+    """Penalty, metrics and gradient with each mode as the other one."""
+    options = RewireSettings(**{"modes": K, "head_slots": SLOTS} | options).checked()
+    (value, metrics), gradient = penalty_and_gradient(
+        options, params, memory, mode, noise
+    )
+    return value, metrics, gradient
+
+
+# Two programs that have all the forms between them.
+FORMS = {
+    "kl": {"distillation": "kl", "alignment": "norm"},
+    "squares": {"distillation": "squares", "alignment": "expanded"},
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_distillation_draws_the_mode_to_the_others(form):
+    options = {"alpha": 1e-3} | FORMS[form]
+    params, memory = make().init(KEY)
+    params = trained(np.random.default_rng(5), params)
+    mode, others = 1, (0, 2)
+    value, metrics, gradient = penalties(options, params, memory, mode)
+    head = head_at(params, 0)
+    policies = [play(params.hidden, orders_of(v), head) for v in params.scores]
+
+    def divergence(p, q):
+        if form == "squares":
+            return np.sum((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2, axis=-1).mean()
+        variance = np.exp(2 * q[1])
+        terms = q[1] - p[1] - 0.5
+        terms += (np.exp(2 * p[1]) + (p[0] - q[0]) ** 2) / (2 * variance)
+        return np.sum(terms, axis=-1).mean()
+
+    expected = np.array([divergence(policy, policies[mode]) for policy in policies])
+    assert np.ptp(expected[list(others)]) > 0.01 * np.max(expected)
+    error = 1e-4 * np.max(expected)
+    np.testing.assert_allclose(metrics["distillation"], expected, atol=error)
+    # A mean over states, on the scale of the published sum over 512 of them.
+    np.testing.assert_allclose(value, 1e-3 * 512 * metrics["distillation"], rtol=1e-5)
+
+    # The other mode is a fixed target.
+    scores = np.asarray(gradient.scores)
+    assert np.all(scores[:, others, :] == 0)
+    assert np.all(np.max(np.abs(scores[:, mode]), axis=-1) > 0)
+    target = policies[0]
+
+    def dense(params):
+        x = OBSERVATION
+        for (weight, bias), z in zip(
+            params.hidden, orders_of(params_scores[mode]), strict=True
+        ):
+            x = x @ weight[z].T + bias[z]
+            x = jnp.where(x > 0, x, 0.2 * x)
+        x = x @ params.heads.weight[0].T + params.heads.bias[0]
+        mean, log_std = x[:, :ACTIONS], x[:, ACTIONS:]
+        p_mean, p_log_std = target
+        if form == "squares":
+            terms = (mean - p_mean) ** 2 + (log_std - p_log_std) ** 2
+        else:
+            terms = jnp.exp(2 * p_log_std) + (p_mean - mean) ** 2
+            terms = log_std + terms / (2 * jnp.exp(2 * log_std))
+        return 0.512 * jnp.mean(jnp.sum(terms, axis=-1))
+
+    params_scores = params.scores
+    expected = jax.jit(jax.grad(dense))(params)
+    for a, b in zip(
+        jax.tree.leaves((gradient.hidden, gradient.heads)),
+        jax.tree.leaves((expected.hidden, expected.heads)),
+        strict=True,
+    ):
+        tolerance = 1e-4 * np.max(np.abs(b))
+        np.testing.assert_allclose(a[0], b, rtol=0, atol=tolerance)
+
+
+def test_nothing_to_distil():
+    # Identical modes, and a single mode whose own noise makes it differ.
+    params, memory = make().init(KEY)
+    value = penalties({"alpha": 1.0}, params, memory, 0)[0]
+    assert np.all(np.abs(value) < 1e-3)
+
+    noise = np.random.default_rng(20).normal(size=QUIET.shape).astype(np.float32)
+    value = penalties({"alpha": 1.0}, params, memory, 0, noise)[0]
+    assert np.all(value > 0.1)
+    options = {"modes": 1, "mode_slots": K, "alpha": 1.0}
+    value, metrics, gradient = penalties(options, params, memory, 0, noise)
+    np.testing.assert_array_equal(value, 0)
+    np.testing.assert_array_equal(metrics["distillation"], 0)
+    for leaf in jax.tree.leaves(gradient):
+        np.testing.assert_array_equal(leaf, 0)
+
+
+# Alignment in the penalty
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_alignment_counts_from_the_second_task_on(form):
+    options = {"alpha": 0.0, "beta": 2.0, "adapter_tau": 0.3} | FORMS[form]
+    method, rng = make(), np.random.default_rng(6)
+    params, memory = method.init(KEY)
+    changed = trained(rng, params)
+    inspect = make(**options).inspect
+    value, _, gradient = penalties(options, changed, memory, 0)
+    np.testing.assert_array_equal(value, 0)
+    assert inspect(changed, memory, OBSERVATION)["alignment"] == 0
+    for leaf in jax.tree.leaves(gradient):
+        np.testing.assert_array_equal(leaf, 0)
+
+    params, memory = after_tasks(method, 1, rng)
+    params, memory = method.start_task(KEY, params, memory, 1)
+    changed = trained(rng, params)
+
+    def expected(hidden, adapters):
+        return wiring.alignment_loss(
+            hidden, params.hidden, adapters, 0.3, expanded=form == "squares"
+        )
+
+    value, _, gradient = penalties(options, changed, memory, 0)
+    loss, wanted = jax.jit(jax.value_and_grad(expected, (0, 1)))(
+        changed.hidden, changed.adapters
+    )
+    told = inspect(changed, memory, OBSERVATION)["alignment"]
+    np.testing.assert_allclose(told, loss, rtol=1e-5)
+    np.testing.assert_allclose(value, 2 * loss, rtol=1e-5)
+    for a, b in zip(
+        jax.tree.leaves((gradient.hidden, gradient.adapters)),
+        jax.tree.leaves(wanted),
+        strict=True,
+    ):
+        np.testing.assert_allclose(a[0], 2 * b, rtol=1e-4, atol=1e-4)
+    for leaf in jax.tree.leaves(gradient.heads):
+        np.testing.assert_array_equal(leaf, 0)
