@@ -15,6 +15,10 @@ T = TypeVar("T")
 
 TimeLimit = Literal["terminal", "bootstrap"]
 """What a time limit means to the critic: an end, or a cut to look beyond."""
+CriticEntropy = Literal["sample", "batch_mean"]
+"""The entropy in a critic's target: each action's own, or the batch's mean."""
+PolicyStates = Literal["current", "both"]
+"""States in the policy's losses: where a transition began, or where it ended, too."""
 
 
 def traced(default: int) -> Any:
@@ -73,6 +77,12 @@ class SacSettings:
       policy_delay: critic updates for each update of policy and temperature.
       target_delay: critic updates for each update of the targets.
       time_limit: what a time limit means to the critics.
+      critic_entropy: what the critics' target takes for the next action's
+        -log π: "sample" that of each action, "batch_mean" the mean over the batch, to
+        which the authors' code comes by broadcasting.
+      policy_states: states in the losses of policy and temperature: "current" those
+        that the batch's transitions begin in, "both" those that they end in, too, as
+        in the authors' code.
       noise_color: of the noise in exploring actions: 0 is white, 1 pink, 2 red
         (Eberhard et al., ICLR 2023). Updates draw white noise.
     """
@@ -91,6 +101,8 @@ class SacSettings:
     policy_delay: int = 2
     target_delay: int = 2
     time_limit: TimeLimit = "terminal"
+    critic_entropy: CriticEntropy = "sample"
+    policy_states: PolicyStates = "current"
     noise_color: float = static(0.0)
 
 

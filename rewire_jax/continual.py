@@ -141,7 +141,10 @@ class Run:
         if program.candidates is None or not rows:
             return None, now.selection
         candidates = program.candidates(self.plan.members, learner, now.stage)
-        result = program.rollout(
+        if not candidates.valid.any():
+            # The same type as below, so that nothing is traced anew.
+            return jnp.zeros(candidates.valid.shape), now.selection
+        result = program.trial(
             jax.tree.map(lambda leaf: np.stack([leaf] * rows), task),
             # Placed as all policies are: else the function is traced once more.
             population.place(_fill(candidates.policies, rows), self.plan.mesh),

@@ -9,8 +9,17 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from rewire_jax import hosted, population, replay, rollout, sac, training
+from rewire_jax.config import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools, axes
+from rewire_jax.methods.base import (
+    Candidates,
+    CandidateScore,
+    Method,
+    Selection,
+    Spec,
+    Tools,
+    axes,
+)
 from rewire_jax.training import Collection, Report, Shape, State
 
 
@@ -33,6 +42,7 @@ class Program(NamedTuple):
       policies: `(members, learner) -> policies [members, tasks]`; without the second
         axis what is `Shared`.
       rollout: `(tasks, policies, keys, count) -> Rollout`, see `rollout.episodes`.
+      trial: the same for candidates, see `Method.candidate_score`.
       expect: what `begin` gives for the same arguments, as shapes.
       traces: `() -> int`, how often a function that trains was traced so far.
       size: `(members, learner) -> [members]`, numbers stored.
@@ -48,6 +58,7 @@ class Program(NamedTuple):
     finish: Callable[..., sac.Learner]
     policies: Callable[..., Any]
     rollout: Callable[..., rollout.Rollout]
+    trial: Callable[..., rollout.Rollout]
     expect: Callable[..., State]
     traces: Callable[[], int]
     size: Callable[..., jax.Array]
@@ -61,15 +72,17 @@ def rollout_function(
     rows: int,
     count: int,
     mesh: Mesh,
+    score: CandidateScore = "episode",
 ) -> Callable[..., rollout.Rollout]:
     """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
 
     Methods whose policies are computed alike share one compiled function.
     """
+    play = rollout.PLAYS[score]
 
     def episodes(tasks: Task, policies: Any, keys: jax.Array) -> rollout.Rollout:
         assert keys.shape[1] == rows
-        return rollout.episodes(environment, act, tasks, policies, keys, count)
+        return play(environment, act, tasks, policies, keys, count)
 
     return population.compiled(episodes, (None, 0, 0), mesh)
 
@@ -147,13 +160,14 @@ def build(
         return sac.restart(learner, member.sac)
 
     def polish(member, state, index, time, done, steps):
+        method = make(spec, member.options)
         update = functools.partial(
             training.learn,
             due=True,
             updates=shape.updates,
             environment=environment,
-            method=make(spec, member.options),
-            settings=member.sac,
+            method=method,
+            settings=method.offline_sac(member.sac),
         )
         key = task_keys(member, index)[3]
 
@@ -194,9 +208,22 @@ def build(
     method = make(spec, example)
     parts = method_of, method.act, task_keys, start, shape, mesh
     if isinstance(environment, HostEnvironment):
+        require(
+            method.candidate_score == "episode",
+            "--candidate-score since_reset: environments that are stepped on the host "
+            "are scored by whole episodes alone",
+        )
         loop = hosted.loop(environment, *parts)
+        trial = loop.rollout
     else:
         loop = _loop(environment, *parts)
+
+        def trial(tasks, policies, keys, count):
+            sizes = keys.shape[1], count, mesh, method.candidate_score
+            return rollout_function(environment, method.act, *sizes)(
+                tasks, policies, keys
+            )
+
     return Program(
         init=over(init, 0),
         consolidate=method.consolidate and over(consolidate, 0, 0, None, None),
@@ -206,6 +233,7 @@ def build(
         policies=over(policies, 0, 0),
         size=over(size, 0, 0),
         baseline=method.baseline,
+        trial=trial,
         **loop._asdict(),
     )
 

@@ -1,5 +1,6 @@
 """Acting in environments: training steps with fresh starts, and whole episodes."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -157,11 +158,7 @@ def episodes(
     Returns:
       `[members, rows, count]`.
     """
-
-    def over(function: Callable[..., Any]) -> Callable[..., Any]:
-        # Members, rows, episodes; a task is shared by members, a policy by episodes.
-        function = jax.vmap(function, (None, None, 0))
-        return jax.vmap(jax.vmap(function, (0, axes(policies), 0)), (None, 0, 0))
+    over = functools.partial(_over, policies)
 
     def reset(task, policy, key):
         return environment.reset(task, key)
@@ -189,10 +186,60 @@ def episodes(
         time, _, alive, _ = carry
         return (time < environment.episode_length) & jnp.any(alive)
 
-    split = jax.vmap(jax.vmap(lambda key: jax.random.split(key, count)))(keys)
-    state = over(reset)(tasks, policies, split)
+    state = over(reset)(tasks, policies, _split(keys, count))
     shape = (*keys.shape, count)
     none = no_success(environment, shape)
     result = Rollout(jnp.zeros(shape), jnp.zeros(shape, jnp.int32), none)
     carry = (jnp.zeros((), jnp.int32), state, jnp.ones(shape, bool), result)
     return jax.lax.while_loop(unfinished, body, carry)[-1]
+
+
+def since_reset(
+    environment: Environment,
+    act: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    tasks: Task,
+    policies: Any,
+    keys: jax.Array,
+    count: int,
+) -> Rollout:
+    """Plays one step less than an episode has, whatever ends on the way.
+
+    What ends goes back to its start. The return is that since then, as the authors'
+    CSP judges its candidates. Arguments and result are those of `episodes`.
+    """
+    over = functools.partial(_over, policies)
+    steps = environment.episode_length - 1
+
+    def start(task, policy, key):
+        return begin(environment, task, key)
+
+    def step(task, policy, episode):
+        mean, _ = act(policy, episode.state.observation)
+        return advance(environment, task, episode, jnp.tanh(mean))
+
+    def body(_, carry):
+        return over(step)(tasks, policies, carry[0])
+
+    first = over(start)(tasks, policies, _split(keys, count))
+    shapes = jax.eval_shape(body, 0, (first,))
+    last = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[1])
+    _, last = jax.lax.fori_loop(0, steps, body, (first, last))
+    return Rollout(last.score, jnp.full(last.score.shape, steps), last.success)
+
+
+PLAYS = {"episode": episodes, "since_reset": since_reset}
+"""How candidates are played, by `Method.candidate_score`."""
+
+
+def _over(policies: Any, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Maps over members, rows and episodes.
+
+    A task is shared by members, a policy by episodes.
+    """
+    function = jax.vmap(function, (None, None, 0))
+    return jax.vmap(jax.vmap(function, (0, axes(policies), 0)), (None, 0, 0))
+
+
+def _split(keys: jax.Array, count: int) -> jax.Array:
+    """Keys `[members, rows, count]` of episodes."""
+    return jax.vmap(jax.vmap(lambda key: jax.random.split(key, count)))(keys)

@@ -14,6 +14,7 @@ from rewire_jax.replay import Batch
 
 Metrics = dict[str, jax.Array]
 _ADAM = optax.scale_by_adam()
+_STATES = {"current": 1, "both": 2}  # of a transition, in the policy's losses
 
 
 class Learner(NamedTuple):
@@ -86,7 +87,8 @@ class Draw(NamedTuple):
 
     Attributes:
       contexts: the method's, for the critics and for the policy.
-      noise: `[2, batch, actions]`, of these two's actions.
+      noise: `[2 or 3, batch, actions]`, first of the critics' actions, then of the
+        policy's: in one or both states of each transition.
       penalty: a key for the method's penalty.
     """
 
@@ -96,7 +98,12 @@ class Draw(NamedTuple):
 
 
 def draw(
-    key: jax.Array, memory: Memory, label: Any, size: tuple[int, int], method: Method
+    key: jax.Array,
+    memory: Memory,
+    label: Any,
+    size: tuple[int, int],
+    method: Method,
+    sac: SacSettings,
 ) -> Draw:
     """A draw for one update.
 
@@ -106,14 +113,17 @@ def draw(
       label: of the update's transitions.
       size: of its actions, `batch, actions`.
       method: the method.
+      sac: SAC's settings.
     """
     critic_key, policy_key, noise_key, penalty_key = jax.random.split(key, 4)
+    states = _STATES[sac.policy_states]
+    acting = jax.tree.map(lambda x: jnp.concatenate([x] * states), label)
     return Draw(
         contexts=(
             method.context(critic_key, memory, "critic", label),
-            method.context(policy_key, memory, "policy", label),
+            method.context(policy_key, memory, "policy", acting),
         ),
-        noise=jax.random.normal(noise_key, (2, *size)),
+        noise=jax.random.normal(noise_key, (1 + states, *size)),
         penalty=penalty_key,
     )
 
@@ -126,28 +136,35 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     action, log_density = networks.sample_action(draw.noise[0], mean, log_std)
     following = method.critic_input(context, batch.next_observation)
     q_next = jnp.min(q_values(learner.target, following, action), axis=0)
+    if sac.critic_entropy == "batch_mean":
+        log_density = jnp.mean(log_density)
     soft_value = q_next - jnp.exp(learner.log_temperature) * log_density
     ended = batch.terminal
     if sac.time_limit == "terminal":
         ended = ended | batch.truncated
     target = sac.reward_scale * batch.reward
     target += sac.discount * jnp.where(ended, 0.0, soft_value)
-    inputs = method.critic_input(context, batch.observation)
+    # The action that was taken is valued by what was stored with it.
+    inputs = method.critic_input(batch.label, batch.observation)
     q = q_values(critic, inputs, batch.action)
     error = q - jax.lax.stop_gradient(target)
     return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
 
 
-def _policy_loss(params, learner, batch, draw, method):
+def _policy_loss(params, learner, batch, draw, method, sac):
     memory, context = learner.memory, draw.contexts[1]
-    gaussian = method.distribution(params, memory, context, batch.observation)
-    action, log_density = networks.sample_action(draw.noise[1], *gaussian)
-    inputs = method.critic_input(context, batch.observation)
+    observation = batch.observation
+    if sac.policy_states == "both":
+        observation = jnp.concatenate([observation, batch.next_observation])
+    noise = draw.noise[1:].reshape(-1, draw.noise.shape[-1])
+    gaussian = method.distribution(params, memory, context, observation)
+    action, log_density = networks.sample_action(noise, *gaussian)
+    inputs = method.critic_input(context, observation)
     q = jnp.min(q_values(learner.critic, inputs, action), axis=0)
     entropy = -jnp.mean(log_density)
     loss = -jnp.exp(learner.log_temperature) * entropy - jnp.mean(q)
     penalty, metrics = method.penalty(
-        draw.penalty, params, memory, context, batch.observation, gaussian
+        draw.penalty, params, memory, context, observation, gaussian
     )
     return loss + penalty, {"policy_loss": loss, "entropy": entropy} | metrics
 
@@ -167,7 +184,7 @@ class _Actor(NamedTuple):
 
 def _update_policy(actor, learner, batch, draw, method, sac):
     gradient, metrics = jax.grad(_policy_loss, has_aux=True)(
-        actor.params, learner, batch, draw, method
+        actor.params, learner, batch, draw, method, sac
     )
     policy_state, temperature_state = actor.optimizers
     updates, policy_state = _step(gradient, policy_state, actor.params, sac.lr_policy)

@@ -15,6 +15,7 @@ from rewire_jax.envs.base import (
     Task,
     TaskChange,
 )
+from rewire_jax.envs.changes import check_names
 from rewire_jax.errors import UserError
 
 
@@ -192,8 +193,16 @@ class DomainKind(NamedTuple):
     backend: str
 
 
+BRAX_BACKENDS = ("v1", "positional", "spring", "generalized", "mjx")
+
+
 def _make_brax(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
+    check_names("Brax backend", [backend], BRAX_BACKENDS)
     # Brax takes seconds to import, and most commands do not need it.
+    if backend == "v1":
+        from rewire_jax.envs import brax_v1
+
+        return brax_v1.make_domain(spec.domain)
     from rewire_jax.envs import brax
 
     return brax.make_domain(spec.domain, backend)
@@ -209,9 +218,9 @@ def _make_probe(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
 
 
 DOMAINS: dict[str, DomainKind] = {
-    "halfcheetah": DomainKind(_make_brax, "positional"),
-    "ant": DomainKind(_make_brax, "positional"),
-    "humanoid": DomainKind(_make_brax, "positional"),
+    "halfcheetah": DomainKind(_make_brax, "v1"),
+    "ant": DomainKind(_make_brax, "v1"),
+    "humanoid": DomainKind(_make_brax, "v1"),
     "metaworld": DomainKind(_make_metaworld, "mujoco"),
     **dict.fromkeys(probe.NAMES, DomainKind(_make_probe, "probe")),
 }

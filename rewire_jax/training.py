@@ -203,7 +203,9 @@ def learn(
         places_key, draw_key = jax.random.split(key)
         places = replay.draw(buffer, places_key, time, (updates, size[0]))
         draws = jax.vmap(
-            lambda key, label: sac.draw(key, learner.memory, label, size, method)
+            lambda key, label: sac.draw(
+                key, learner.memory, label, size, method, settings
+            )
         )(jax.random.split(draw_key, updates), replay.labels(buffer, places, time))
 
         def batch(number):

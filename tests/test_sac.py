@@ -49,11 +49,14 @@ METHOD = make_method(SPEC)
 
 @jax.jit
 def update(learner, metrics, batch, count, settings):
-    return sac.update(learner, metrics, batch, drawn(batch), count, METHOD, settings)
+    return sac.update(
+        learner, metrics, batch, drawn(batch, settings), count, METHOD, settings
+    )
 
 
-def drawn(batch):
-    return sac.draw(jax.random.key(1), (), (), batch.action.shape, METHOD)
+def drawn(batch, settings):
+    size = batch.action.shape
+    return sac.draw(jax.random.key(1), (), (), size, METHOD, settings)
 
 
 @pytest.fixture(autouse=True)
@@ -96,7 +99,7 @@ def learner_and_batch(settings=SETTINGS):
         truncated=(np.arange(size) >= 2) & (np.arange(size) < 4),
         next_observation=numbers[:, 3:6],
     )
-    metrics = sac.first_metrics(learner, batch, drawn(batch), METHOD, settings)
+    metrics = sac.first_metrics(learner, batch, drawn(batch, settings), METHOD, settings)
     return learner, batch, metrics
 
 

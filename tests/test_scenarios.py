@@ -84,7 +84,7 @@ def test_the_papers_scenarios(name):
     assert names == tasks.split() * repeats
     assert scenario.name == name
     assert scenario.domain == name.split("/")[0]
-    assert scenario.backend == "positional"
+    assert scenario.backend == "v1"
     assert scenario.interactions == interactions
     assert scenario.distinct == len(set(names))
     first = list(dict.fromkeys(names))
@@ -167,7 +167,7 @@ def test_inverted_means_all_and_normal_means_nothing():
 
 def test_defective_module_hides_half():
     task = make_scenario("halfcheetah/transfer").tasks[2]
-    assert sorted(task.observation_mask) == [0.0] * 8 + [1.0] * 9
+    assert sorted(task.observation_mask) == [0.0] * 9 + [1.0] * 9
 
 
 def test_scenarios_of_a_domain_share_its_environment():

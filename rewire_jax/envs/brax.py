@@ -23,7 +23,6 @@ from brax.envs.base import State as BraxState
 
 from rewire_jax.envs import changes
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
-from rewire_jax.errors import UserError
 from rewire_jax.film import Film
 
 NAMES = ("halfcheetah", "ant", "humanoid")
@@ -75,9 +74,7 @@ def _make_domain(name: str, backend: str) -> Domain:
     ]
 
     def make_task(change: TaskChange) -> Task:
-        if change.extra:
-            raise UserError(f"Brax tasks take no extra values: {dict(change.extra)}.")
-        _check_factors(change, list(bodies))
+        changes.check_physics(change, list(bodies))
         return Task(
             physics=_change_system(system, change, bodies, _RESIZED[name]),
             action_scale=changes.action_scale(joints, change.actions),
@@ -174,15 +171,6 @@ def _body_ids(model: mujoco.MjModel) -> dict[str, int]:
         name = model.body(body).name or joint.replace("ankle", "lower_leg")
         ids[name] = body
     return ids
-
-
-def _check_factors(change: TaskChange, bodies: list[str]) -> None:
-    changes.check_names("body", change.bodies, bodies)
-    for body, factor in change.bodies.items():
-        if not factor > 0:
-            raise UserError(f"The factor of body {body!r} must be > 0, not {factor}.")
-    if not change.friction >= 0:
-        raise UserError(f"friction must be >= 0, not {change.friction}.")
 
 
 def _change_system(

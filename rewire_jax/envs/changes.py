@@ -1,4 +1,4 @@
-"""The parts of a `TaskChange` that mean the same in every domain."""
+"""The parts of a `TaskChange` that mean the same in several domains."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rewire_jax.envs.base import TaskChange
 from rewire_jax.errors import UserError
 
 ALL_JOINTS = "*"
@@ -53,6 +54,18 @@ def observation_mask(size: int, hidden: float) -> jax.Array:
     mask = np.repeat([0.0, 1.0], [zeros, size - zeros])
     drawn = np.random.RandomState(0).permutation(mask)
     return jnp.asarray(drawn.astype(np.float32))
+
+
+def check_physics(change: TaskChange, bodies: Sequence[str]) -> None:
+    """Raises `UserError` unless a domain with these bodies can be changed so."""
+    if change.extra:
+        raise UserError(f"Brax tasks take no extra values: {dict(change.extra)}.")
+    check_names("body", change.bodies, bodies)
+    for body, factor in change.bodies.items():
+        if not factor > 0:
+            raise UserError(f"The factor of body {body!r} must be > 0, not {factor}.")
+    if not change.friction >= 0:
+        raise UserError(f"friction must be >= 0, not {change.friction}.")
 
 
 def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:

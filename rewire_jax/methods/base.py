@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.config import SacSettings
 from rewire_jax.replay import Batch
 
 Params = Any
@@ -18,6 +19,7 @@ Context = Any
 """Pytree of what a method draws for one update or one acting step."""
 Policy = Any
 """Pytree from which `Method.act` computes actions; parts of it may be `Shared`."""
+CandidateScore = Literal["episode", "since_reset"]
 Purpose = Literal["act", "critic", "policy"]
 """What a context is drawn for, which is a step or an update of critics or policy."""
 
@@ -137,17 +139,21 @@ class Method(NamedTuple):
         a progress report.
       adjust_updates: `(updates, memory) -> updates`, after the optimiser.
       critic_input: `(context, observation) -> [..., observations + extra]`, what
-        the critics see beside the action.
+        the critics see beside the action; of a stored transition its label is given
+        as the context.
       extra: numbers in it beyond the observation.
       fresh_critic: whether the critics, too, start anew with each task.
       consolidate: `(key, params, memory, task, tools) -> params, memory`, when a
         task's interactions are over; or None.
       offline: updates from the buffer after that, a share of the interactions. They
         begin with fresh optimisers and temperature, and need `consolidate`.
+      offline_sac: SAC's settings for these, from those of the run.
       candidates: `(params, memory, task) -> Candidates`, rolled out at the end of
         each task, or None where nothing is to be chosen.
       baseline: whether they are rolled out at a task's start, too.
       in_budget: whether these interactions are part of the task's own.
+      candidate_score: what a candidate is judged by: the return of its "episode", or,
+        after as many steps as an episode has, that "since_reset", the latest reset.
       end_task: `(params, memory, task, Selection or None) -> params, memory`.
     """
 
@@ -174,9 +180,11 @@ class Method(NamedTuple):
     fresh_critic: bool = False
     consolidate: Callable[..., tuple[Params, Memory]] | None = None
     offline: float = 0.0
+    offline_sac: Callable[[SacSettings], SacSettings] = lambda sac: sac
     candidates: Callable[[Params, Memory, jax.Array], Candidates] | None = None
     baseline: bool = False
     in_budget: bool = False
+    candidate_score: CandidateScore = "episode"
     end_task: Callable[..., tuple[Params, Memory]] = (
         lambda params, memory, task, selection: (params, memory)
     )

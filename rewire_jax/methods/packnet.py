@@ -1,6 +1,8 @@
 """PackNet: each task keeps a share of one network's weights (arXiv 1711.05769)."""
 
-from typing import Any, NamedTuple
+import dataclasses
+import math
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,10 +26,14 @@ class PackNetSettings:
         tasks find nothing to train and are played by the weights of those before.
       finetune: updates of the kept weights after the pruning, for each interaction
         of the task.
+      finetune_targets: which of these updates move the target critics: "delay" every
+        so many-th, as in training; "nested" those among them that also update the
+        policy, as in the authors' code.
     """
 
     keep: float = 0.125
     finetune: float = static(0.1)
+    finetune_targets: Literal["delay", "nested"] = "delay"
 
     def checked(self) -> "PackNetSettings":
         """The settings as they are; `UserError` if they make no sense."""
@@ -45,8 +51,8 @@ def preset(scenario: str, period: int, profile: str) -> PackNetSettings:
     Published are 12.5% for each task, and 100,000 updates after 1M interactions or,
     on Humanoid, 2M.
     """
-    del profile
     return PackNetSettings(
+        finetune_targets="nested" if profile == "authors" else "delay",
         keep=min(0.125, 1 / period),
         finetune=0.05 if scenario == "humanoid/hard" else 0.1,
     )
@@ -102,6 +108,12 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
         trained = jnp.full_like(memory.trained, task)
         return params, memory._replace(owners=owners, trained=trained)
 
+    def offline_sac(sac):
+        if options.finetune_targets == "delay":
+            return sac
+        both = math.lcm(sac.policy_delay, sac.target_delay)
+        return dataclasses.replace(sac, target_delay=both)
+
     def end_task(params, memory, task, selection):
         del task, selection
         return params, memory._replace(
@@ -128,6 +140,7 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
         adjust_updates=adjust_updates,
         consolidate=consolidate,
         offline=options.finetune,
+        offline_sac=offline_sac,
         end_task=end_task,
     )
 

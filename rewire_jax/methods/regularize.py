@@ -100,7 +100,7 @@ def preset_ewc(scenario: str, period: int, profile: str) -> EwcSettings:
     del period
     return EwcSettings(
         coefficient=_coefficients(scenario)[1],
-        fisher_states=1024 if profile == "paper" else 256,
+        fisher_states=256 if profile == "quick" else 1024,
     )
 
 

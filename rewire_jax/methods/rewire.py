@@ -47,6 +47,8 @@ class RewireSettings:
       mode_rate: the learning rate of scores is multiplied by K: "step" scales the
         step as the paper has it, "gradient" the gradient as the authors' code,
         which Adam all but undoes.
+      select_first: whether a mode is chosen by its return after the first task, too;
+        otherwise the first mode is kept there, as in the authors' code.
       head_slots: output heads and cached orders; task t uses slot t mod this, so
         that a repeated task finds its own again.
       width: neurons in each hidden layer of the policy; 0 for as many as the critics
@@ -66,6 +68,7 @@ class RewireSettings:
     noise: float = 0.1
     dropout: float = static(0.0)
     mode_rate: Literal["step", "gradient"] = "step"
+    select_first: bool = True
     head_slots: int = 4
     width: int = 0
 
@@ -126,9 +129,11 @@ def preset(scenario: str, period: int, profile: str) -> RewireSettings:
     published = dataclasses.replace(
         _published(scenario, period), distillation="squares", alignment="expanded"
     )
-    if profile == "paper":
-        return published
-    return dataclasses.replace(published, adapter_rate=10.0)
+    if profile == "authors":
+        return dataclasses.replace(published, mode_rate="gradient", select_first=False)
+    if profile == "quick":
+        return dataclasses.replace(published, adapter_rate=10.0)
+    return published
 
 
 def _published(scenario: str, period: int) -> RewireSettings:
@@ -297,19 +302,26 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             ),
         )
 
-    def candidates(params, memory, task):
-        del task
+    def choosing(memory):
+        return (memory.learned > 0) | options.select_first
+
+    def mode_policies(params, memory):
         head = at(params.heads, memory.learned % slots)
 
         def policy(scores):
             orders = jnp.argsort(scores, axis=-1)
             return [*wiring.fold(params.hidden, orders), head]
 
-        return Candidates(jax.vmap(policy)(params.scores), jnp.arange(places) < modes)
+        return jax.vmap(policy)(params.scores)
+
+    def candidates(params, memory, task):
+        del task
+        valid = (jnp.arange(places) < modes) & choosing(memory)
+        return Candidates(mode_policies(params, memory), valid)
 
     def inspect(params, memory, observation):
         # Without noise and dropout, unlike the distillation.
-        policies, valid = candidates(params, memory, memory.learned)
+        policies, valid = mode_policies(params, memory), jnp.arange(places) < modes
         gaussians = jax.vmap(networks.mlp_policy, (0, None))(policies, observation)
         against = jax.vmap(gaussian_kl, (None, 0))
         pairs = jnp.mean(jax.vmap(against, (0, None))(gaussians, gaussians), axis=-1)
@@ -330,7 +342,8 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             valued = valid & ~jnp.isnan(selection.after)
             after = jnp.where(valued, selection.after, -jnp.inf)
             before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / modes
-            order = jnp.argsort(params.scores[jnp.argmax(after)], axis=-1)
+            chosen = choosing(memory) * jnp.argmax(after)
+            order = jnp.argsort(params.scores[chosen], axis=-1)
             failed = (memory.learned > 0) & (jnp.max(after) < before)
         began = Params(
             hidden=memory.previous,

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 
 from rewire_jax import networks
 from rewire_jax.config import flag, require, settings, traced
-from rewire_jax.methods.base import Candidates, Method, Spec, count, put, tile
+from rewire_jax.methods.base import (
+    Candidates,
+    CandidateScore,
+    Method,
+    Spec,
+    count,
+    put,
+    tile,
+)
 from rewire_jax.networks import Linear
 
 
@@ -28,6 +36,12 @@ class CspSettings:
       samples: weights that the search draws from each of the two subspaces.
       estimations: transitions over which it takes the mean of each one's value.
       rollouts: weights that it proposes, half of them from either subspace.
+      next_weights: by which weights the next action is taken and valued in the
+        critics' target: "stored" those of the transition; "redrawn" others, as in the
+        authors' code, which makes the targets alike for all weights.
+      candidate_score: what proposed weights are judged by: "episode", the return of
+        their episodes; "since_reset", where the environment can end an episode, that
+        since its latest reset, as in the authors' code.
     """
 
     width: int = 0
@@ -37,6 +51,8 @@ class CspSettings:
     samples: int = 4096
     estimations: int = 1024
     rollouts: int = 8
+    next_weights: Literal["stored", "redrawn"] = "stored"
+    candidate_score: CandidateScore = "episode"
 
     def checked(self) -> "CspSettings":
         """The settings as they are; `UserError` if they make no sense."""
@@ -73,7 +89,11 @@ _PUBLISHED: dict[str, tuple[Literal["flat", "peaked"], int]] = {
 
 
 def preset(scenario: str, period: int, profile: str) -> CspSettings:
-    """Published settings or the defaults; a shorter search in the quick profile."""
+    """Published settings or the defaults; a shorter search in the quick profile.
+
+    The authors' search takes the mean of the values of both states of each transition.
+    Twice the transitions have the same expectation.
+    """
     del period
     options = CspSettings()
     if scenario.startswith("continual_world/"):
@@ -82,9 +102,16 @@ def preset(scenario: str, period: int, profile: str) -> CspSettings:
     if scenario in _PUBLISHED:
         distribution, every = _PUBLISHED[scenario]
         options = CspSettings(distribution=distribution, resample_every=every)
-    if profile == "paper":
-        return options
-    return dataclasses.replace(options, samples=1024, estimations=64)
+    if profile == "quick":
+        return dataclasses.replace(options, samples=1024, estimations=64)
+    if profile == "authors":
+        # On Continual World nothing ends an episode before its time.
+        if not scenario.startswith("continual_world/"):
+            options = dataclasses.replace(options, candidate_score="since_reset")
+        return dataclasses.replace(
+            options, estimations=2 * options.estimations, next_weights="redrawn"
+        )
+    return options
 
 
 class Memory(NamedTuple):
@@ -152,10 +179,10 @@ def csp(spec: Spec, options: CspSettings) -> Method:
         return jnp.where(due[:, None], drawn, label)
 
     def context(key, memory, purpose, label):
-        # Q is that of the policy with the stored weights, now and in the next state,
-        # as in the paper. The authors' code draws the next action's weights anew,
-        # which makes its targets the same for all weights.
-        if purpose == "policy":
+        # As in the paper, Q is that of the policy with the stored weights, now and in
+        # the next state.
+        redrawn = purpose == "critic" and options.next_weights == "redrawn"
+        if purpose == "policy" or redrawn:
             return from_new(key, memory, label.shape[:-1])
         return label
 
@@ -259,6 +286,7 @@ def csp(spec: Spec, options: CspSettings) -> Method:
         consolidate=consolidate,
         candidates=candidates,
         in_budget=True,
+        candidate_score=options.candidate_score,
         end_task=end_task,
     )
 
