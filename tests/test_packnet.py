@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rewire_jax.config import SacSettings
 from rewire_jax.errors import UserError
 from rewire_jax.methods import packnet
 from rewire_jax.methods.base import Spec
@@ -248,6 +249,16 @@ def test_presets_leave_room_for_a_round_of_tasks():
     assert packnet.preset("humanoid/hard", 4, "paper").finetune == 0.05
     assert packnet.preset("continual_world/cw10", 10, "paper").keep == 0.1
     assert make(finetune=0.2).offline == 0.2
+
+
+@pytest.mark.parametrize(("policy", "target"), [(2, 4), (4, 2), (2, 3), (1, 1)])
+def test_the_authors_targets_move_only_with_the_policy(policy, target):
+    sac = SacSettings(policy_delay=policy, target_delay=target)
+    nested = make(finetune_targets="nested").offline_sac(sac)
+    moves = [n for n in range(48) if n % policy == 0 and n % target == 0]
+    assert moves == [n for n in range(48) if n % nested.target_delay == 0]
+    assert nested.policy_delay == policy
+    assert make().offline_sac(sac) == sac
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,7 @@
+import dataclasses
+
+import pytest
+
 from rewire_jax.methods import METHODS
 from rewire_jax.presets import preset
 from rewire_jax.scenarios import make_scenario
@@ -34,3 +38,37 @@ def test_quick_is_the_paper_profile_with_less_of_it():
     assert quick.tasks == paper.tasks == 3  # though stick-pull comes twice
     assert quick.options.head_slots == 2
     assert quick.reward == "v1"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_authors_is_the_paper_profile_with_what_their_code_does(method):
+    scenario = make_scenario("ant/forgetting")
+    ours, theirs = (preset(scenario, method, p) for p in ("paper", "authors"))
+    assert theirs.sac == dataclasses.replace(
+        ours.sac, critic_entropy="batch_mean", policy_states="both"
+    )
+    assert theirs.eval_episodes == 512 * 10
+    same = ("interactions", "envs", "updates", "warmup", "buffer", "tasks")
+    assert all(getattr(ours, name) == getattr(theirs, name) for name in same)
+    differing = {
+        name: value
+        for name, value in vars(theirs.options).items()
+        if value != getattr(ours.options, name)
+    }
+    assert differing == {
+        "rewire": {"mode_rate": "gradient", "select_first": False},
+        "csp": {
+            "estimations": 2048,
+            "next_weights": "redrawn",
+            "candidate_score": "since_reset",
+        },
+        "packnet": {"finetune_targets": "nested"},
+    }.get(method, {})
+
+
+def test_authors_on_continual_world():
+    scenario = make_scenario("continual_world/t3")
+    theirs = preset(scenario, "csp", "authors")
+    assert theirs.interactions == 1_000_000
+    assert theirs.sac.critic_entropy == "batch_mean"
+    assert theirs.options.candidate_score == "episode"

@@ -75,6 +75,23 @@ def test_without_selection_the_first_mode_is_kept():
     np.testing.assert_array_equal(memory.orders[0], orders_of(params.scores[0]))
 
 
+def test_the_authors_choose_no_mode_after_the_first_task():
+    method, rng = make(select_first=False), np.random.default_rng(8)
+    params, memory = method.init(KEY)
+    assert not np.any(method.candidates(params, memory, 0).valid)
+    params = trained(rng, params)
+    # Zeros, since nothing was played; even if something was, it counts for nothing.
+    for after in ([0.0] * K, [-5.0] * (K - 1) + [9.0]):
+        _, kept = method.end_task(params, memory, 0, selection(after))
+        np.testing.assert_array_equal(kept.orders[0], orders_of(params.scores[0]))
+    # Later on they do.
+    params, memory = method.start_task(KEY, params, kept, 1)
+    assert np.all(method.candidates(params, memory, 1).valid)
+    params = trained(rng, params)
+    _, kept = method.end_task(params, memory, 1, selection([1.0] * (K - 1) + [9.0]))
+    np.testing.assert_array_equal(kept.orders[1], orders_of(params.scores[K - 1]))
+
+
 def test_the_first_task_is_never_undone():
     method, rng = make(), np.random.default_rng(9)
     params, memory = method.init(KEY)

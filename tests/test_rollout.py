@@ -137,3 +137,28 @@ def test_what_follows_an_end_does_not_count():
     result = play(tasks, policies, keys)
     np.testing.assert_array_equal(result.lengths, [[[2, 2], [4, 4]]])
     np.testing.assert_allclose(result.returns, [[[3, 3], [10, 10]]])
+
+
+def test_the_return_since_the_latest_reset():
+    rows, count = 3, 5
+    limits, gains = [100.0, 4.0, 1.0], [1.0, 2.0, -3.0]
+    tasks = jax.tree.map(
+        lambda *x: np.stack(x).astype(np.float32), *map(make_task, limits, gains)
+    )
+    policies = {"weights": np.zeros((1, rows, 2)), "bias": np.zeros((1, rows))}
+    keys = jax.random.split(jax.random.key(1), (1, rows))
+    play = jax.jit(functools.partial(rollout.since_reset, COUNTER, act, count=count))
+    result = play(tasks, policies, keys)
+    starts = jax.vmap(jax.vmap(lambda key: jax.random.split(key, count)))(keys)
+    starts = np.asarray(
+        jax.vmap(lambda key: reset(None, key).observation[0])(starts.ravel())
+    ).reshape(1, rows, count)
+    for place in np.ndindex(1, rows, count):
+        total, steps, limit, gain = 0.0, 0, limits[place[1]], gains[place[1]]
+        for _ in range(LENGTH - 1):
+            if steps and starts[place] + steps >= limit:
+                total, steps = 0.0, 0
+            steps += 1
+            total += gain * steps
+        assert result.returns[place] == pytest.approx(total)
+    np.testing.assert_array_equal(result.lengths, LENGTH - 1)

@@ -99,7 +99,9 @@ def learner_and_batch(settings=SETTINGS):
         truncated=(np.arange(size) >= 2) & (np.arange(size) < 4),
         next_observation=numbers[:, 3:6],
     )
-    metrics = sac.first_metrics(learner, batch, drawn(batch, settings), METHOD, settings)
+    metrics = sac.first_metrics(
+        learner, batch, drawn(batch, settings), METHOD, settings
+    )
     return learner, batch, metrics
 
 
@@ -161,9 +163,21 @@ def first_adam_step(gradient, rate):
     return jax.tree.map(lambda g: -rate * g / (np.abs(g) + 1e-8), gradient)
 
 
-@pytest.mark.parametrize("time_limit", ["terminal", "bootstrap"])
-def test_one_update_is_what_the_formulas_say(time_limit):
-    settings = dataclasses.replace(SETTINGS, time_limit=time_limit)
+@pytest.mark.parametrize(
+    ("time_limit", "critic_entropy", "policy_states"),
+    [
+        ("terminal", "sample", "current"),
+        ("bootstrap", "batch_mean", "current"),
+        ("terminal", "batch_mean", "both"),
+    ],
+)
+def test_one_update_is_what_the_formulas_say(time_limit, critic_entropy, policy_states):
+    settings = dataclasses.replace(
+        SETTINGS,
+        time_limit=time_limit,
+        critic_entropy=critic_entropy,
+        policy_states=policy_states,
+    )
     learner, batch, metrics = learner_and_batch(settings)
     after, metrics = update(learner, metrics, batch, 0, settings)
     old, new, batch = wide(learner), wide(after), wide(batch)
@@ -171,7 +185,11 @@ def test_one_update_is_what_the_formulas_say(time_limit):
     temperature = 0.7
     action, density = sample(old.params, batch.next_observation)
     soft = both_q(old.target, batch.next_observation, action).min(axis=0)
-    soft = soft - temperature * density
+    if critic_entropy == "sample":
+        soft = soft - temperature * density
+    else:
+        # As PyTorch does in the authors' code: [batch] - [batch, 1].
+        soft = soft - temperature * density[:, None]
     going = 1 - batch.terminal
     if time_limit == "terminal":
         going = going * (1 - batch.truncated)
@@ -181,7 +199,9 @@ def test_one_update_is_what_the_formulas_say(time_limit):
         q = both_q(critic, batch.observation, batch.action)
         return sum(np.mean((each - target) ** 2) for each in q)
 
-    assert metrics["critic_loss"] == pytest.approx(critic_loss(old.critic), rel=1e-4)
+    if critic_entropy == "sample":
+        loss = critic_loss(old.critic)
+        assert metrics["critic_loss"] == pytest.approx(loss, rel=1e-4)
     q = both_q(old.critic, batch.observation, batch.action)
     assert metrics["q"] == pytest.approx(q.mean(), rel=1e-4)
     # Adam's first moments hold a tenth of the first gradient.
@@ -191,10 +211,14 @@ def test_one_update_is_what_the_formulas_say(time_limit):
     moved = jax.tree.map(np.add, old.critic, first_adam_step(gradient, 2e-2))
     close(new.critic, moved, atol=1e-4)
 
+    states = batch.observation
+    if policy_states == "both":
+        states = np.concatenate([states, batch.next_observation])
+
     # The policy sees the critics that were just updated.
     def policy_loss(params, weight=PENALTY):
-        action, density = sample(params, batch.observation)
-        q = both_q(new.critic, batch.observation, action).min(axis=0)
+        action, density = sample(params, states)
+        q = both_q(new.critic, states, action).min(axis=0)
         squares = sum(np.sum(leaf**2) for leaf in jax.tree.leaves(params))
         return np.mean(temperature * density - q) + weight * squares
 
@@ -204,7 +228,7 @@ def test_one_update_is_what_the_formulas_say(time_limit):
     moved = jax.tree.map(np.add, old.params, first_adam_step(gradient, 1e-2))
     close(new.params, moved, atol=1e-4)
 
-    density = sample(old.params, batch.observation)[1]
+    density = sample(old.params, states)[1]
     assert metrics["entropy"] == pytest.approx(-density.mean(), rel=1e-4)
     assert metrics["temperature"] == pytest.approx(temperature)
 

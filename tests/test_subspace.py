@@ -253,6 +253,19 @@ def test_critics_see_the_stored_weights():
     assert method.fresh_critic
 
 
+def test_the_authors_critics_see_redrawn_weights_at_the_next_action():
+    method, _, memory, _ = in_training(
+        np.random.default_rng(1), 1, next_weights="redrawn"
+    )
+    label = random_weights(np.random.default_rng(2), 500, 2)
+    drawn = method.context(KEY, memory, "critic", label)
+    assert drawn.shape == label.shape
+    assert not np.any(np.all(np.isclose(drawn, label), axis=-1))
+    assert_on_simplex(drawn, 2)
+    same = method.context(jax.random.key(1), memory, "act", label)
+    assert_same(same, jnp.array(label))
+
+
 # The mixture
 
 
