@@ -79,17 +79,18 @@ def run(job: FirstTask) -> None:
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
     variants = {name: VARIANTS[name] for name in LABELS}
-    runs = suite.train(job.runs(job.scenario, variants), job)
-    found = first_task.read("Figure 3", runs, LABELS, "mode_divergence")
+    runs = job.first_runs(variants)
+    suite.train(runs, job)
+    evolved = first_task.read("Figure 3", runs, LABELS, "mode_divergence")
     notes = (
         "Diverge-and-converge is said to appear where the divergence ends below half "
         "of its peak, both being medians over a tenth of the progress reports.",
         "",
-        *map(tell, found.curves.values()),
+        *(tell(trained.curve) for trained in evolved.found.values()),
         "",
     )
     path = job.folder("figure3") / "figure3"
-    first_task.write(path, QUANTITY, found, [list(LABELS)], notes, log=True)
+    first_task.write(path, QUANTITY, evolved, [list(LABELS)], notes, log=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,12 @@
-"""What the pictures of training share: curves of runs on their first task."""
+"""What the pictures of training share: curves of runs on their first task.
+
+Every seed is a run of its own. So results come seed by seed, and several commands can
+train some of the seeds each (`--seed`, `--seeds`, `--variants`) and leave the picture
+to the last one.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,14 +15,17 @@ import numpy as np
 from experiments import suite
 from rewire_jax.config import require
 from rewire_jax.evolution import Curve, evolution
+from rewire_jax.figures import Array
 from rewire_jax.numerals import number
 from rewire_jax.report import heading
-from rewire_jax.rundata import read_progress, read_run
+from rewire_jax.rundata import RunData, read_progress, read_run
 
 READING = (
-    "Over seeds; those that diverged have no part in it. The end is the last tenth of "
-    "the progress reports."
+    "Over seeds; those that diverged have no part in it, nor have runs that are not "
+    "finished. The end is the last tenth of the progress reports."
 )
+_EPISODES = 128
+_REPORT, _CHECKPOINT = 12_800, 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +35,62 @@ class FirstTask(suite.Experiment):
     Attributes:
       scenario: name of the scenario.
       tasks: of the sequence that are trained; only the first is shown.
+      variants: which of the runs to train and show, by their names; all if empty.
     """
 
     scenario: str = "halfcheetah/forgetting"
     tasks: int = 1
+    variants: tuple[str, ...] = ()
+
+    def first_runs(self, variants: suite.Variants) -> list[suite.Run]:
+        """A run for each seed and variant, one seed after the other.
+
+        Reports and checkpoints are as dense as a curve needs. What the policy earns in
+        the end is told by 128 episodes at most.
+        """
+        unknown = set(self.variants) - set(variants)
+        require(
+            not unknown,
+            f"--variants {' '.join(unknown)}: choose from {', '.join(variants)}",
+        )
+        chosen = {
+            name: variant
+            for name, variant in variants.items()
+            if name in (self.variants or variants)
+        }
+        runs = []
+        for seed in range(self.seed, self.seed + self.seeds):
+            for run in replace(self, seed=seed, seeds=1).runs(self.scenario, chosen):
+                given = run.settings
+                settings = replace(
+                    given,
+                    eval_episodes=min(given.eval_episodes, _EPISODES),
+                    selection_episodes=min(given.selection_episodes, 32),
+                    report_every=min(given.report_every, _REPORT),
+                    checkpoint_every=min(given.checkpoint_every, _CHECKPOINT),
+                )
+                folder = run.folder / f"seed-{seed}"
+                runs.append(run._replace(folder=folder, settings=settings))
+        return runs
+
+
+class Trained(NamedTuple):
+    """What the runs of a variant give.
+
+    Attributes:
+      curve: of what was reported in training, `[seeds, points]`.
+      seeds: theirs.
+      returns: `[seeds]`, of the policy after the task, without exploration.
+    """
+
+    curve: Curve
+    seeds: tuple[int, ...]
+    returns: Array
+
+    @property
+    def end(self) -> Array:
+        """`[seeds]`, the mean of the last tenth of the reports."""
+        return self.curve.values[:, -tenth(self.curve) :].mean(axis=1)
 
 
 class Evolution(NamedTuple):
@@ -38,12 +98,12 @@ class Evolution(NamedTuple):
 
     Attributes:
       title: what was run, and with what budget.
-      curves: by the name of the run, in the order of the labels.
-      origins: Markdown, where the runs come from.
+      found: by variant, in the order of the labels.
+      origins: Markdown, where the runs come from, and which are not finished.
     """
 
     title: str
-    curves: dict[str, Curve]
+    found: dict[str, Trained]
     origins: list[str]
 
 
@@ -57,35 +117,72 @@ def read(
 
     Args:
       subject: what the title begins with.
-      runs: that have results.
-      labels: by the name of the run.
+      runs: of one seed each, in folders of their variants.
+      labels: by variant.
       value: name of what to read; by default it is the training return.
 
     Raises:
       UserError: there is nothing to show yet.
     """
-    curves, origins = {}, []
-    for run in runs:
-        name, data = run.folder.name, read_run(run.folder)
-        x, values = (read_progress(data, value) if value else data.curve)[0]
-        if x.size and data.kept.any():
-            curves[name] = Curve(labels[name], x, values[data.kept])
-            origins.append(f"- {suite.origin(labels[name], data)}")
-    require(bool(curves), "none of the runs has reported on a seed without divergence")
-    seeds = f"{len(data.seeds)} seed{'' if len(data.seeds) == 1 else 's'}"
-    subject = f"{subject} on the first task of {data.settings['scenario']}"
-    title = heading(subject, data.settings, len(data.tasks), seeds)
-    curves = {name: curves[name] for name in labels if name in curves}
-    return Evolution(title, curves, origins)
+    found, origins, settings, tasks = {}, [], {}, 1
+    for name, label in labels.items():
+        datas = [
+            read_run(run.folder)
+            for run in runs
+            if run.folder.parent.name == name and run.finished
+        ]
+        kept = [data for data in datas if data.kept.all()]
+        if kept:
+            found[name] = _gather(label, kept, value)
+            settings, tasks = kept[0].settings, len(kept[0].tasks)
+        if datas:
+            origins.append(_origin(label, datas))
+    require(bool(found), "none of the runs has ended without divergence")
+    missing = [str(run.folder) for run in runs if not run.finished]
+    if missing:
+        origins.append(f"- **not finished: {', '.join(missing)}**")
+    counts = sorted({len(trained.seeds) for trained in found.values()})
+    several = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
+    seeds = f"{several} seed{'' if counts[-1] == 1 else 's'}"
+    subject = f"{subject} on the first task of {settings['scenario']}"
+    return Evolution(heading(subject, settings, tasks, seeds), found, origins)
+
+
+def _gather(label: str, kept: Sequence[RunData], value: str | None) -> Trained:
+    """Runs of one variant as one."""
+    parts = [(read_progress(run, value) if value else run.curve)[0] for run in kept]
+    # A run that was stopped may have reports in between.
+    shared = set.intersection(*(set(x) for x, _ in parts))
+    values = [values[:, [at in shared for at in x]] for x, values in parts]
+    return Trained(
+        Curve(label, np.array(sorted(shared)), np.concatenate(values)),
+        tuple(seed for run in kept for seed in run.seeds),
+        np.concatenate([run.scores[:, 0, 0] for run in kept]),
+    )
+
+
+def _origin(label: str, datas: Sequence[RunData]) -> str:
+    """Markdown: where the runs of a variant come from."""
+    seeds = ", ".join(str(seed) for data in datas for seed in data.seeds)
+    lost = ", ".join(str(seed) for data in datas for seed in data.diverged)
+    commits = dict.fromkeys(f"`{data.provenance.get('commit')}`" for data in datas)
+    devices = dict.fromkeys(str(data.provenance.get("device")) for data in datas)
+    return (
+        f"- {label}: `{datas[0].folder.parent}`, seeds {seeds}"
+        + (f" (diverged: {lost})" if lost else "")
+        + f", commit {', '.join(commits)}, {', '.join(devices)}, command "
+        f"`{datas[0].provenance.get('command')}`"
+    )
 
 
 def write(
     path: Path,
     quantity: str,
-    found: Evolution,
+    evolved: Evolution,
     panels: Sequence[Sequence[str]],
     notes: Sequence[str] = (),
     *,
+    table: Sequence[Sequence[str]] | None = None,
     log: bool = False,
 ) -> None:
     """Writes a table of curves, their numbers and their picture.
@@ -93,18 +190,19 @@ def write(
     Args:
       path: of the files, without a suffix.
       quantity: what the values are.
-      found: what is shown.
-      panels: of the picture, names of the runs in each.
+      evolved: what is shown.
+      panels: of the picture, variants in each.
       notes: lines of Markdown above how to read the table.
+      table: for people; by default that of `summary`.
       log: whether the picture's values are.
     """
-    title, curves, origins = found
+    title, found, origins = evolved
     picture = path.with_suffix(".png")
     shown = (f"![{title}]({picture.name})", "", *notes, READING, "", *origins)
-    table = summary(list(curves.values()), quantity)
-    suite.write(path, title, table, shown, rows(curves))
-    drawn = [[curves[name] for name in panel if name in curves] for panel in panels]
-    evolution(drawn, quantity, title, picture, log=log)
+    table = table or summary(list(found.values()), quantity)
+    suite.write(path, title, table, shown, rows(found))
+    drawn = [[found[name].curve for name in panel if name in found] for panel in panels]
+    evolution([panel for panel in drawn if panel], quantity, title, picture, log=log)
     print(picture)
 
 
@@ -113,26 +211,38 @@ def tenth(curve: Curve) -> int:
     return max(curve.x.size // 10, 1)
 
 
-def summary(curves: Sequence[Curve], quantity: str) -> list[list[str]]:
+def summary(found: Sequence[Trained], quantity: str) -> list[list[str]]:
     """A table of the end of each curve and of its mean over all of training."""
-    head = [quantity, "median at the end", "mean", "95% interval", "mean of all"]
-    table = [head]
-    for curve in curves:
-        last = curve.values[:, -tenth(curve) :].mean(axis=1, keepdims=True)
-        end = Curve(curve.label, curve.x[-1:], last)
-        shown = [*end.median, *end.mean, *end.interval[:, 0], np.nanmean(curve.values)]
-        median, mean, low, high, whole = map(number, shown)
-        table.append([curve.label, median, mean, f"{low} to {high}", whole])
+    table = [[quantity, "median at the end", "mean", "95% interval", "mean of all"]]
+    for trained in found:
+        whole = float(np.nanmean(trained.curve.values))
+        table.append([trained.curve.label, *ends(trained), number(whole)])
     return table
 
 
-def rows(curves: Mapping[str, Curve]) -> list[dict[str, Any]]:
-    """The numbers, a row for each run and progress report."""
+def ends(trained: Trained) -> list[str]:
+    """Median, mean and interval of the mean at the end."""
+    end = Curve("", trained.curve.x[-1:], trained.end[:, None])
+    low, high = map(number, end.interval[:, 0])
+    return [number(end.median[0]), number(end.mean[0]), f"{low} to {high}"]
+
+
+def rows(found: Mapping[str, Trained]) -> list[dict[str, Any]]:
+    """The numbers, a row for each run and progress report.
+
+    The return without exploration stands in a run's last row.
+    """
     return [
-        {"run": name, "seeds": len(curve.values), "interactions": int(x)}
-        | dict(zip(("median", "mean", "low", "high"), values, strict=True))
-        for name, curve in curves.items()
-        for x, *values in zip(
-            curve.x, curve.median, curve.mean, *curve.interval, strict=True
+        {
+            "run": name,
+            "seed": seed,
+            "interactions": int(x),
+            "value": float(at),
+            "deterministic": float(after) if x == trained.curve.x[-1] else None,
+        }
+        for name, trained in found.items()
+        for seed, values, after in zip(
+            trained.seeds, trained.curve.values, trained.returns, strict=True
         )
+        for x, at in zip(trained.curve.x, values, strict=True)
     ]

@@ -5,9 +5,8 @@ to one side for longer.
 """
 
 from experiments import first_task, suite
-from experiments.first_task import FirstTask
+from experiments.first_task import FirstTask, Trained
 from rewire_jax import tables
-from rewire_jax.rundata import read_run
 from rewire_jax.summary import spread
 
 # Two of the runs are Figure 5's.
@@ -19,12 +18,10 @@ VARIANTS: suite.Variants = {
 LABELS = {"ft1": "FT-1", "ft1-pink": "FT-1, pink noise", "rewire": "Ours"}
 
 
-def tell(run: suite.Run) -> str:
-    """A run's evaluation after the first task, in Markdown."""
-    data = read_run(run.folder)
-    # `[seeds, stages, tasks]`.
-    returns = tables.spread(spread(data.scores[data.kept, 0, 0]))
-    return f"- {LABELS[run.folder.name]}: **{returns}**"
+def tell(trained: Trained) -> str:
+    """Evaluations after the first task, in Markdown."""
+    returns = tables.spread(spread(trained.returns))
+    return f"- {trained.curve.label}: **{returns}**"
 
 
 def run(job: FirstTask) -> None:
@@ -34,17 +31,18 @@ def run(job: FirstTask) -> None:
       UserError: wrong arguments.
       rewire_jax.Stopped: interrupted; the same command goes on.
     """
-    runs = suite.train(job.runs(job.scenario, VARIANTS), job)
-    found = first_task.read("Pink noise", runs, LABELS)
+    runs = job.first_runs(VARIANTS)
+    suite.train(runs, job)
+    evolved = first_task.read("Pink noise", runs, LABELS)
     notes = (
         "Training returns are those of exploring actions. Evaluated without noise "
         "after the task, mean ± sample standard deviation over seeds:",
         "",
-        *map(tell, runs),
+        *map(tell, evolved.found.values()),
         "",
     )
     path = job.folder("pink-noise") / "pink-noise"
-    first_task.write(path, "training return", found, [list(LABELS)], notes)
+    first_task.write(path, "training return", evolved, [list(LABELS)], notes)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ def write_run(
     folder: Path,
     *,
     method: str = "rewire",
+    seed: int = 0,
     seeds: int = 2,
     stages: int = 3,
     diverged: tuple[int, ...] = (),
@@ -49,6 +50,7 @@ def write_run(
         }
 
     folder.mkdir(parents=True)
+    members = range(seed, seed + seeds)
     head = {
         "format": 1,
         "settings": {
@@ -56,7 +58,7 @@ def write_run(
             "method": method,
             "profile": "quick",
             "backend": "positional",
-            "seed": 0,
+            "seed": seed,
             "seeds": seeds,
             "interactions": BUDGET,
             **settings,
@@ -90,7 +92,7 @@ def write_run(
         }
         for stage in range(-1, stages)
         for task in range(len(tasks))
-        for seed in range(seeds)
+        for seed in members
     ]
     chunks = [(stage, x) for stage in range(stages) for x in (250, 500, 1000)]
     training = [
@@ -104,7 +106,7 @@ def write_run(
             **success(learning[stage, k % 3], seed),
         }
         for k, (stage, x) in enumerate(chunks)
-        for seed in range(seeds)
+        for seed in members
     ]
     timing = [
         {

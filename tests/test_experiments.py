@@ -280,7 +280,9 @@ def test_figure4_has_narrower_and_wider_policies(trained, tmp_path):
 
 def test_pink_noise_differs_in_the_noise_alone(trained, tmp_path):
     pink_noise.run(FirstTask(seeds=2, out=tmp_path))
-    runs = {folder.name: settings for folder, settings, _ in trained}
+    assert [folder.name for folder, *_ in trained] == ["seed-0"] * 3 + ["seed-1"] * 3
+    assert [settings.seed for _, settings, _ in trained] == [0] * 3 + [1] * 3
+    runs = {f.parent.name: settings for f, settings, _ in trained[:3]}
     colors = {name: settings.sac.noise_color for name, settings in runs.items()}
     assert colors == {"ft1": 0, "ft1-pink": 1, "rewire": 0}
     sac = dataclasses.replace(runs["ft1"].sac, noise_color=1)
@@ -292,9 +294,12 @@ def test_pink_noise_differs_in_the_noise_alone(trained, tmp_path):
     assert "- FT-1: **600 ± 141**\n- FT-1, pink noise: **600 ± 141**" in shown
     assert "- Ours: **1,100 ± 141**" in shown
     found = rows(out / "pink-noise.csv")
-    assert [row["run"] for row in found] == [name for name in runs for _ in range(3)]
+    assert [row["run"] for row in found] == [name for name in runs for _ in range(6)]
     # Training returns of seeds 0 and 1, without a value at first.
-    assert [row["median"] for row in found[:3]] == ["", "650.0", "1150.0"]
+    values = ["", "500.0", "1000.0", "", "800.0", "1300.0"]
+    assert [row["value"] for row in found[:6]] == values
+    after = ["", "", "500.0", "", "", "700.0"]
+    assert [row["deterministic"] for row in found[:6]] == after
     assert (out / "pink-noise.png").stat().st_size > 0
 
 
@@ -302,9 +307,9 @@ def test_figure5_turns_modes_and_distillation_off(trained, tmp_path, monkeypatch
     monkeypatch.setattr(suite, "RESULTS", tmp_path / "kept")
     job = FirstTask(out=tmp_path, seeds=2, keep=True)
     figure5_evolution.run(job)
-    chosen = {f.name: s for f, s, _ in trained}
+    chosen = {f.parent.name: s for f, s, _ in trained}
     assert {s.tasks for s in chosen.values()} == {1}
-    ours, alone = chosen["rewire"].options, chosen["rewire-aligned"].options
+    ours, alone = chosen["rewire"].options, chosen["rewire-k1"].options
     undistilled = chosen["rewire-undistilled"].options
     assert (ours.modes, undistilled.modes, alone.modes) == (3, 3, 1)
     assert (ours.alpha, undistilled.alpha) == (1e-5, 0)
@@ -313,9 +318,19 @@ def test_figure5_turns_modes_and_distillation_off(trained, tmp_path, monkeypatch
     # Seed 1 earns 300 more, and the first report of all has no reward.
     path = tmp_path / "kept/figure5-quick-tasks-1/figure5.csv"
     found = [row for row in rows(path) if row["run"] == "ft1"]
-    assert [row["mean"] for row in found] == ["", "650.0", "1150.0"]
+    assert [row["value"] for row in found[3:]] == ["", "800.0", "1300.0"]
     assert path.with_suffix(".png").stat().st_size > 0
-    assert "1,150" in path.with_suffix(".md").read_text()
+    shown = path.with_suffix(".md").read_text()
+    assert "| FT-1 | 2 | 1,150 | 1,150 | 1,000 to 1,300 | 0 of 2 | not | 600 |" in shown
+    assert "| FT-1 | 1,000 / 500 | 1,300 / 700 |" in shown
+    # What is there is shown without what is not.
+    job = dataclasses.replace(job, seeds=3, train=False)
+    figure5_evolution.run(job)
+    assert "rewire-k1/seed-2" in path.with_suffix(".md").read_text()
+    some = dataclasses.replace(job, variants=("ft1", "rewire"), seed=2, train=True)
+    trained.clear()
+    figure5_evolution.run(some)
+    assert [f.parent.name for f, *_ in trained] == ["ft1", "rewire"] * 3
 
 
 @pytest.mark.parametrize(
@@ -330,6 +345,7 @@ def test_figure5_turns_modes_and_distillation_off(trained, tmp_path, monkeypatch
         (table3_ablation, Table3, "--scenario probe/reach --profile slow"),
         (figure4_tradeoff, Figure4, "--scenarios probe/reach --interactions 3"),
         (figure5_evolution, FirstTask, "--scenario probe/reach --tasks 9"),
+        (figure5_evolution, FirstTask, "--scenario probe/reach --variants ft2"),
     ],
 )
 def test_what_is_wrong_ends_in_a_line_before_anything_runs(
