@@ -34,10 +34,16 @@ STANDS = 2_000
 
 
 def reached(trained: Trained) -> Array:
-    """`[seeds]`, interactions at the first report above 2,000; infinite if none is."""
-    above = trained.curve.values > STANDS
-    first = trained.curve.x[np.argmax(above, axis=1)]
-    return np.where(above.any(axis=1), first, np.inf)
+    """`[seeds]`, interactions when a whole episode's return is first above 2,000.
+
+    Infinite where none is.
+    """
+    x = trained.curve.x
+    whole = [at for at in range(x.size) if x[at] >= trained.episode]
+    above = np.array([trained.over_episode(at) > STANDS for at in whole]).T
+    if not whole:
+        return np.full(len(trained.seeds), np.inf)
+    return np.where(above.any(axis=1), x[whole][np.argmax(above, axis=1)], np.inf)
 
 
 def beats(one: Array, other: Array) -> tuple[float, float, float]:

@@ -22,7 +22,8 @@ from rewire_jax.rundata import RunData, read_progress, read_run
 
 READING = (
     "Over seeds; those that diverged have no part in it, nor have runs that are not "
-    "finished. The end is the last tenth of the progress reports."
+    "finished. The end is the time of the last whole episode: all environments begin "
+    "theirs together, so each part of an episode counts once."
 )
 _EPISODES = 128
 _REPORT, _CHECKPOINT = 12_800, 100_000
@@ -60,7 +61,9 @@ class FirstTask(suite.Experiment):
         }
         runs = []
         for seed in range(self.seed, self.seed + self.seeds):
-            for run in replace(self, seed=seed, seeds=1).runs(self.scenario, chosen):
+            one = replace(self, seed=seed, seeds=1)
+            parent = self.out / self.name(f"{self.scenario}-first-task")
+            for run in one.runs(self.scenario, chosen):
                 given = run.settings
                 settings = replace(
                     given,
@@ -69,7 +72,7 @@ class FirstTask(suite.Experiment):
                     report_every=min(given.report_every, _REPORT),
                     checkpoint_every=min(given.checkpoint_every, _CHECKPOINT),
                 )
-                folder = run.folder / f"seed-{seed}"
+                folder = parent / run.folder.name / f"seed-{seed}"
                 runs.append(run._replace(folder=folder, settings=settings))
         return runs
 
@@ -81,16 +84,31 @@ class Trained(NamedTuple):
       curve: of what was reported in training, `[seeds, points]`.
       seeds: theirs.
       returns: `[seeds]`, of the policy after the task, without exploration.
+      episode: interactions in which all environments play an episode.
     """
 
     curve: Curve
     seeds: tuple[int, ...]
     returns: Array
+    episode: float
+
+    def over_episode(self, at: int) -> Array:
+        """`[seeds]`, the mean over the episode that ends with a report.
+
+        A report counts by how much of its time lies in the episode; before a whole
+        one has been played, all do.
+        """
+        x, values = self.curve.x[: at + 1], self.curve.values[:, : at + 1]
+        took = np.diff(x, prepend=0.0)
+        weight = np.clip(
+            took - np.maximum(x[-1] - self.episode - (x - took), 0), 0, None
+        )
+        return values[:, weight > 0] @ (weight[weight > 0] / weight.sum())
 
     @property
     def end(self) -> Array:
-        """`[seeds]`, the mean of the last tenth of the reports."""
-        return self.curve.values[:, -tenth(self.curve) :].mean(axis=1)
+        """`[seeds]`, the mean over the last episode."""
+        return self.over_episode(self.curve.x.size - 1)
 
 
 class Evolution(NamedTuple):
@@ -158,6 +176,7 @@ def _gather(label: str, kept: Sequence[RunData], value: str | None) -> Trained:
         Curve(label, np.array(sorted(shared)), np.concatenate(values)),
         tuple(seed for run in kept for seed in run.seeds),
         np.concatenate([run.scores[:, 0, 0] for run in kept]),
+        kept[0].episode_length * float(kept[0].settings["envs"]),
     )
 
 

@@ -8,6 +8,7 @@ import json
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -32,7 +33,7 @@ class PaperRate:
     out: Path = Path("experiments/results/paper-rate.json")
 
 
-def measure(name: str, job: PaperRate, folder: Path) -> dict[str, float | str | int]:
+def measure(name: str, job: PaperRate, folder: Path) -> dict[str, Any]:
     """Runs the beginning of one scenario."""
     scenario = rewire_jax.make_scenario(name)
     paper = rewire_jax.preset(scenario, job.method, "paper")
@@ -54,6 +55,7 @@ def measure(name: str, job: PaperRate, folder: Path) -> dict[str, float | str | 
     total = paper.tasks * paper.interactions
     return {
         "scenario": name,
+        "backend": scenario.backend,
         "interactions": settings.interactions,
         "interactions_per_second": rate,
         "paper_interactions": total,
@@ -73,7 +75,7 @@ def run(job: PaperRate) -> None:
     job.out.parent.mkdir(parents=True, exist_ok=True)
     job.out.write_text(json.dumps(result, indent=1) + "\n")
     table = [
-        f"# {job.method}, paper profile, 1 seed, positional backend, first "
+        f"# {job.method}, paper profile, 1 seed, {rows[0]['backend']} backend, first "
         f"{job.interactions:,} interactions; {facts['device']}",
         "",
         "| scenario | interactions/s | whole scenario | training would take |",

@@ -38,8 +38,7 @@ AVERAGED = (
 )
 READING = (
     "Performance is the return at the end, averaged over tasks, divided by that of "
-    f"SAC-N; {AVERAGED} The paper's results were made with Brax v1, whose physics is "
-    "another."
+    f"SAC-N; {AVERAGED} The paper's results were made on Brax v1 (`--backend v1`)."
 )
 _KINDS = ("forgetting", "transfer", "robustness", "compositionality")
 DOMAINS = {

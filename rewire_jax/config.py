@@ -81,8 +81,8 @@ class SacSettings:
         -log π: "sample" that of each action, "batch_mean" the mean over the batch, to
         which the authors' code comes by broadcasting.
       policy_states: states in the losses of policy and temperature: "current" those
-        that the batch's transitions begin in, "both" those that they end in, too, as
-        in the authors' code.
+        that the batch's transitions begin in, "both" the observations after them, too.
+        In the authors' code these are, after an ended episode, the next one's first.
       noise_color: of the noise in exploring actions: 0 is white, 1 pink, 2 red
         (Eberhard et al., ICLR 2023). Updates draw white noise.
     """

@@ -141,17 +141,20 @@ class Run:
         if program.candidates is None or not rows:
             return None, now.selection
         candidates = program.candidates(self.plan.members, learner, now.stage)
+        mesh = self.plan.mesh
         if not candidates.valid.any():
-            # The same type as below, so that nothing is traced anew.
-            return jnp.zeros(candidates.valid.shape), now.selection
+            # What is given to the end of a task is of one type, played or not.
+            return population.place(
+                (jnp.zeros(candidates.valid.shape), now.selection), mesh
+            )
         result = program.trial(
             jax.tree.map(lambda leaf: np.stack([leaf] * rows), task),
             # Placed as all policies are: else the function is traced once more.
-            population.place(_fill(candidates.policies, rows), self.plan.mesh),
+            population.place(_fill(candidates.policies, rows), mesh),
             self.keys(_SELECTION, 2 * now.stage + phase, rows),
             self.plan.settings.selection_episodes,
         )
-        return _judge(result, candidates.valid, now.selection)
+        return population.place(_judge(result, candidates.valid, now.selection), mesh)
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""

@@ -147,8 +147,11 @@ def _continual_world(paper: Settings) -> Settings:
         report_every=5_000,
         checkpoint_every=50_000,
     )
-    if paper.profile != "quick":
+    if paper.profile == "paper":
         return paper
+    if paper.profile == "authors":
+        played = min(paper.selection_episodes, 10)
+        return dataclasses.replace(paper, eval_episodes=10, selection_episodes=played)
     return dataclasses.replace(
         paper,
         interactions=min(30_000, paper.interactions),

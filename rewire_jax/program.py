@@ -72,7 +72,7 @@ def rollout_function(
     rows: int,
     count: int,
     mesh: Mesh,
-    score: CandidateScore = "episode",
+    score: CandidateScore,
 ) -> Callable[..., rollout.Rollout]:
     """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
 
@@ -272,7 +272,7 @@ def _loop(
 
     def episodes(tasks, policies, keys, count):
         rows = keys.shape[1]
-        function = rollout_function(environment, act, rows, count, mesh)
+        function = rollout_function(environment, act, rows, count, mesh, "episode")
         return function(tasks, policies, keys)
 
     begins = over(begin, 0, 0, 0, None, None)

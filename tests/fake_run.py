@@ -61,6 +61,7 @@ def write_run(
             "seed": seed,
             "seeds": seeds,
             "interactions": BUDGET,
+            "envs": 25,
             **settings,
         },
         "tasks": tasks,

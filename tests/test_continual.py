@@ -211,14 +211,24 @@ def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     )
     # Evaluation; selection of each of three modes. Other tests use them, too.
     shared = [
-        rollout_function(scenario.environment, made.act, *sizes, prepared.mesh)
+        rollout_function(
+            scenario.environment, made.act, *sizes, prepared.mesh, "episode"
+        )
         for sizes in ((8, 4), (3, 2))
     ]
     before = [function._cache_size() for function in shared]
     continual.train(settings, tmp_path / "run", scenario=scenario)
     assert [f._cache_size() - n for f, n in zip(shared, before, strict=True)] == [1, 1]
     # The last two are not for this method, those before are not compiled.
-    others = ("rollout", "baseline", "expect", "traces", "consolidate", "polish")
+    others = (
+        "rollout",
+        "trial",
+        "baseline",
+        "expect",
+        "traces",
+        "consolidate",
+        "polish",
+    )
     program = prepared.program._asdict()
     program = {name: f for name, f in program.items() if name not in others}
     assert {name: f._cache_size() for name, f in program.items()} == dict.fromkeys(

@@ -18,6 +18,7 @@ from rewire_jax.evolution import Curve
 from tests.fake_run import write_run
 
 POINTS = 20
+ENVS = 0.2  # so that they play an episode of ten steps in two reports
 X = np.arange(1.0, POINTS + 1)
 LABELS = {"rewire": "Ours", "ft1": "FT-1"}
 
@@ -53,7 +54,7 @@ def test_figure3_of_a_real_run(tmp_path, monkeypatch):
     monkeypatch.setattr(rewire_jax, "preset", tiny)
     job = FirstTask(scenario="probe/reach", seeds=2, out=tmp_path)
     figure3_mode_kl.run(job)
-    runs = tmp_path / "probe-reach-quick-tasks-1"
+    runs = tmp_path / "probe-reach-first-task-quick-tasks-1"
     assert {run.name for run in runs.iterdir()} == set(figure3_mode_kl.LABELS)
     path = tmp_path / "figure3-quick-tasks-1" / "figure3.csv"
     assert path.with_suffix(".png").stat().st_size > 0
@@ -80,7 +81,15 @@ def fake(folder: Path, values: np.ndarray, **kept) -> list[suite.Run]:
     runs = []
     for seed, each in enumerate(values):
         run = suite.Run(folder / f"seed-{seed}", None, None)
-        write_run(run.folder, stages=1, tasks=("normal",), seed=seed, seeds=1, **kept)
+        write_run(
+            run.folder,
+            envs=ENVS,
+            stages=1,
+            tasks=("normal",),
+            seed=seed,
+            seeds=1,
+            **kept,
+        )
         told = [
             {"stage": 0, "seed": seed, "interactions": int(x), "reward": value / 10}
             for x, value in zip(X, each, strict=True)
@@ -150,8 +159,20 @@ def test_how_probable_one_earns_more():
 def test_when_a_return_is_reached():
     values = np.array([[0, 2500, 100, 2500], [0, 1, 2, 3], [0, 0, 0, 2001]])
     curve = Curve("", np.array([10.0, 20.0, 30.0, 40.0]), values)
-    trained = first_task.Trained(curve, (0, 1, 2), np.zeros(3))
-    assert reached(trained).tolist() == [20, np.inf, 40]
+    trained = first_task.Trained(curve, (0, 1, 2), np.zeros(3), 20.0)
+    # Means over two reports: 1250 and 1300; 1; 1000.5. One fast report is no episode.
+    assert reached(trained).tolist() == [np.inf] * 3
+    curve = curve._replace(values=2 * values)
+    assert reached(trained._replace(curve=curve)).tolist() == [20, np.inf, 40]
+    assert np.isinf(reached(trained._replace(episode=50.0))).all()
+
+
+def test_a_report_counts_by_its_share_of_the_last_episode():
+    curve = Curve("", np.array([10.0, 20.0, 26.0]), np.array([[8.0, 4.0, 1.0]]))
+    trained = first_task.Trained(curve, (0,), np.zeros(1), 12.0)
+    np.testing.assert_allclose(trained.end, (6 * 4 + 6 * 1) / 12)
+    np.testing.assert_allclose(trained.over_episode(1), (2 * 8 + 10 * 4) / 12)
+    np.testing.assert_allclose(trained.over_episode(0), 8)
 
 
 def test_peak_and_end_of_a_curve():

@@ -86,7 +86,7 @@ def play_functions(prepared: plan.Plan) -> dict[str, Callable]:
     }
     environment = prepared.scenario.environment
     return {
-        name: rollout_function(environment, act, *size, prepared.mesh)
+        name: rollout_function(environment, act, *size, prepared.mesh, "episode")
         for name, size in sizes.items()
     }
 

@@ -72,3 +72,5 @@ def test_authors_on_continual_world():
     assert theirs.interactions == 1_000_000
     assert theirs.sac.critic_entropy == "batch_mean"
     assert theirs.options.candidate_score == "episode"
+    assert (theirs.eval_episodes, theirs.selection_episodes) == (10, 1)
+    assert preset(scenario, "rewire", "authors").selection_episodes == 10

@@ -13,10 +13,9 @@ from experiments.speed.timing import Loop, in_turn
 from rewire_jax import figures
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.lanes import Lanes
-from rewire_jax.scenarios import make_scenario
+from rewire_jax.scenarios import BRAX_BACKENDS, make_scenario
 
 BRAX = "halfcheetah/forgetting"
-BACKENDS: tuple[str, ...] = ("positional", "spring", "generalized", "mjx")
 COUNTS: tuple[int, ...] = (1, 64, 256)
 COUNTS_ON_GPU = (*COUNTS, 2048)
 META_WORLD = "continual_world/t3"
@@ -62,7 +61,8 @@ def compiled_loops(
 def measure(effort: Effort) -> list[Row]:
     """A row for each environment, backend and number."""
     loops: dict[Case, Loop] = {}
-    name, backends, counts = BRAX, BACKENDS, COUNTS
+    name, counts = BRAX, COUNTS
+    backends: tuple[str, ...] = BRAX_BACKENDS
     if jax.default_backend() == "gpu":
         counts = COUNTS_ON_GPU
     if effort.quick:

@@ -182,7 +182,7 @@ def _ratio(what: str, policy: str) -> Callable[[Row], str]:
 
 PART = Part(
     title="Whole loops, and peers",
-    reading="HalfCheetah, positional, 128 environments, 64 updates after each of their "
+    reading="HalfCheetah on brax.v1, 128 environments, 64 updates after each of their "
     "steps, networks of 3 × 256, batches of 256. The last four columns say how often "
     "ours repeats while the other does once, with a policy update as often; in bold "
     "where the other is ahead. SBX's and PyTorch's learners are in the host's hands "
