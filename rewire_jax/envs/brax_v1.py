@@ -259,17 +259,16 @@ def _model(config: Any, radii: Any) -> mujoco.MjModel:
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1])
     for body in config.bodies:
         for collider in body.colliders:
+            # A body for each keeps their order: the world's own geometries come first.
+            of = spec.worldbody.add_body()
             r, half = next(radius), collider.capsule.length / 2
             if collider.HasField("plane"):
-                spec.worldbody.add_geom(
-                    type=kinds.mjGEOM_PLANE, size=[40, 40, 1], material="floor"
-                )
+                of.add_geom(type=kinds.mjGEOM_PLANE, size=[40, 40, 1], material="floor")
                 continue
-            moving = spec.worldbody.add_body()
-            moving.add_freejoint()
+            of.add_freejoint()
             # A capsule's length includes its round ends; a ball has nothing between.
             ball = half <= r
-            moving.add_geom(
+            of.add_geom(
                 type=kinds.mjGEOM_SPHERE if ball else kinds.mjGEOM_CAPSULE,
                 size=[r, 0 if ball else half - r, 0],
                 rgba=[0.8, 0.6, 0.4, 1],
