@@ -85,7 +85,8 @@ for package in sorted(packages, key=lambda package: package["name"].lower()):
 endef
 export LOCK
 
-lint: setup ## Check style, format and types
+lint: setup ## Check style, format, types and which room imports which
+	$(VENV)/bin/lint-imports
 	$(RUN) -m ruff check
 	$(RUN) -m ruff format --check
 	$(RUN) -m mypy rewire_jax experiments docs notebooks
@@ -101,10 +102,10 @@ test-slow: setup ## Run the slow tests
 	$(RUN) -m pytest -m slow $(WORKERS)
 
 test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (compiles for minutes at first)
-	$(RUN) -m pytest tests/test_metaworld_mjx.py
+	$(RUN) -m pytest tests/envs/test_metaworld_mjx.py
 
 test-bench: setup-bench ## Run the tests of what bench-speed compares to
-	$(RUN) -m pytest tests/test_bench_peers.py
+	$(RUN) -m pytest tests/experiments/test_bench_peers.py
 
 bench_options = $(strip \
 	$(call option,scenario,$(SCENARIO)) \

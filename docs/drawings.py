@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 import rewire_jax
 from rewire_jax.methods import wiring
-from rewire_jax.networks import Linear
+from rewire_jax.nn.networks import Linear
 
 _COLOURS = mpl.colormaps["tab10"].colors  # type: ignore[attr-defined]
 _SCORES = np.array([0.62, 0.10, 0.95, 0.35, 0.78, 0.22])

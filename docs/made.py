@@ -14,7 +14,8 @@ import tyro
 
 import rewire_jax
 from experiments import suite
-from rewire_jax import cli, config
+from rewire_jax.cli import main
+from rewire_jax.core.settings import SacSettings, Settings, flag, traced_fields
 from rewire_jax.methods import METHODS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -87,7 +88,7 @@ def argument(item: Item) -> str:
     """The flag, or the name where an argument goes by its place."""
     marks = getattr(item.kind, "__metadata__", ())
     placed = tyro.conf.Positional in marks
-    return f"`{item.name.upper() if placed else config.flag(item.name)}`"
+    return f"`{item.name.upper() if placed else flag(item.name)}`"
 
 
 def arguments(cls: type) -> str:
@@ -110,14 +111,14 @@ def prose(thing: Any) -> str:
 
 def usage(_: str) -> str:
     """What `rewire-jax` says of itself."""
-    return f"```text\n{cli._USAGE.strip()}\n```"
+    return f"```text\n{main._USAGE.strip()}\n```"
 
 
 def commands(_: str) -> str:
     """Each command of `rewire-jax`: the dataclass of its name in `cli`."""
     parts = []
-    for name in cli._COMMANDS:
-        cls = getattr(cli, name.title())
+    for name in main._COMMANDS:
+        cls = getattr(main, name.title())
         needs = " SCENARIO" if "settings" in cls.__annotations__ else ""
         parts += [f"## `rewire-jax {name}{needs}`", prose(cls), arguments(cls)]
         if needs:
@@ -156,13 +157,13 @@ def settings(which: str) -> str:
         )
         for profile in ("paper", "quick")
     }
-    parts = {"run": config.Settings, "sac": config.SacSettings}
+    parts = {"run": Settings, "sac": SacSettings}
     cls = parts.get(which) or METHODS[which].settings
     if which == "sac":
         chosen: list[Any] = [preset.sac for preset in presets.values()]
     else:
         chosen = [p if which == "run" else p.options for p in presets.values()]
-    traced = config.traced_fields(cls)
+    traced = traced_fields(cls)
     return table(
         ["setting", "values", "paper", "quick", "axis", "meaning"],
         [
@@ -215,7 +216,7 @@ def by_scenario(_: str) -> str:
         same: dict[tuple[str, ...], list[str]] = {}
         for at, row in rows.items():
             same.setdefault(tuple(shown(row[n]) for n in names), []).append(f"`{at}`")
-        heads = ["scenarios", *(f"`{config.flag(name)}`" for name in names)]
+        heads = ["scenarios", *(f"`{flag(name)}`" for name in names)]
         if names:
             lines = [[", ".join(at), *cells] for cells, at in same.items()]
             parts += [f"### {title}", table(heads, lines)]

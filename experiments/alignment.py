@@ -17,9 +17,10 @@ import numpy as np
 import optax
 import tyro
 
-from rewire_jax import keep_compiled, networks
+from rewire_jax import keep_compiled
 from rewire_jax.methods import wiring
-from rewire_jax.runfolder import provenance
+from rewire_jax.nn import networks
+from rewire_jax.storage.run_folder import provenance
 
 # Form of the loss, factor on the adapters' learning rate.
 VARIANTS = (("norm", 1), ("expanded", 1), ("expanded", 10), ("expanded", 0.01))

@@ -15,8 +15,8 @@ import tyro
 
 from rewire_jax.envs.base import Environment, TaskChange
 from rewire_jax.envs.metaworld import make_domain
-from rewire_jax.runfolder import provenance
-from rewire_jax.tables import markdown
+from rewire_jax.reports.run_tables import markdown
+from rewire_jax.storage.run_folder import provenance
 
 HEADS = ("task", "environments", "steps/s", "reset s", "kB/environment")
 

@@ -25,9 +25,10 @@ from experiments.speed import (
     updates,
 )
 from experiments.speed.part import Effort, Part
-from rewire_jax import figures, runfolder
-from rewire_jax.config import require
-from rewire_jax.tables import markdown
+from rewire_jax.core.settings import require
+from rewire_jax.reports import plots
+from rewire_jax.reports.run_tables import markdown
+from rewire_jax.storage import run_folder
 
 PARTS: dict[str, Part] = {
     "updates": updates.PART,
@@ -71,11 +72,11 @@ def report(results: Mapping[str, Any], folder: Path) -> str:
         lines += ["", f"## {part.title}", "", *markdown([*part.columns], cells)]
         if part.picture:
             title, draw = part.picture
-            figure, (axes,) = figures.empty((7.0, 4.2), 1, 1)
+            figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
             draw(axes, rows)
             axes.grid(color="0.9")
             axes.set_axisbelow(True)
-            figures.entitle(figure, title, how["device"])
+            plots.entitle(figure, title, how["device"])
             figure.savefig(folder / f"{name}.png")
             lines += [f"![{title}]({name}.png)", ""]
         lines += [part.reading, ""]
@@ -104,7 +105,7 @@ def run(bench: Bench) -> dict[str, Any]:
     device = jax.devices()[0].device_kind.lower().replace(" ", "-")
     results = Path("runs") if bench.quick else suite.RESULTS
     folder = bench.out or results / f"speed-{device}"
-    runfolder.make(folder)
+    run_folder.make(folder)
     path = folder / "result.json"
     found = json.loads(path.read_text()) if path.exists() else {}
     for name in chosen:
@@ -116,9 +117,9 @@ def run(bench: Bench) -> dict[str, Any]:
             "seconds": time.perf_counter() - began,
             "load": [before, os.getloadavg()[0]],
             "rounds": effort.rounds,
-            "provenance": runfolder.provenance(),
+            "provenance": run_folder.provenance(),
         }
-        runfolder.write(path, found)
+        run_folder.write(path, found)
         text = report(found, folder)
         (folder / "report.md").write_text(text, encoding="utf-8")
     print(text, folder, sep="\n")

@@ -11,14 +11,15 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 import rewire_jax
 
-METHODS = "ft1 ft_l2 packnet ewc pnn sac_n ft_n csp rewire".split()
-SHORT = {
+METHODS = ["ft1", "ft_l2", "packnet", "ewc", "pnn", "sac_n", "ft_n", "csp", "rewire"]
+SHORT: dict[str, Any] = {
     "tasks": 2,
     "interactions": 2_560,
     "warmup": 640,
@@ -29,7 +30,7 @@ SHORT = {
 }
 
 
-def digest(scenario: str, method: str, folder: Path, **changes: int) -> str:
+def digest(scenario: str, method: str, folder: Path, **changes: Any) -> str:
     """Trains a run and digests what it wrote and learned."""
     made = rewire_jax.make_scenario(scenario)
     settings = rewire_jax.preset(made, method, "quick")
@@ -55,7 +56,9 @@ def digest(scenario: str, method: str, folder: Path, **changes: int) -> str:
 def main() -> None:
     """Prints a line for each run."""
     rewire_jax.keep_compiled()
-    runs = [("probe/reach", method, {}) for method in METHODS]
+    runs: list[tuple[str, str, dict[str, Any]]] = [
+        ("probe/reach", method, {}) for method in METHODS
+    ]
     runs += [("halfcheetah/forgetting", method, {}) for method in ("rewire", "ft1")]
     short = {"tasks": 1, "interactions": 600, "warmup": 200, "random_interactions": 100}
     runs += [

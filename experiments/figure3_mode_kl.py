@@ -12,9 +12,9 @@ import numpy as np
 from experiments import first_task, suite
 from experiments.figure5_evolution import VARIANTS
 from experiments.first_task import FirstTask
-from rewire_jax.evolution import Curve
-from rewire_jax.figures import Array
-from rewire_jax.numerals import number
+from rewire_jax.core.formatting import number
+from rewire_jax.reports.plots import Array
+from rewire_jax.reports.training_curve_plot import Curve
 
 LABELS = {"rewire": "with L_KL", "rewire-undistilled": "without L_KL"}
 QUANTITY = "KL divergence between modes"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import rewire_jax
 from experiments import suite
-from rewire_jax import published
-from rewire_jax.scatter import Point, tradeoff
+from rewire_jax.reports import paper_results
+from rewire_jax.reports.tradeoff_plot import Point, tradeoff
 
 SIZED = {"CSP-S": ("csp", 175 / 256), "Ours-L": ("rewire", 384 / 256)}
 
@@ -28,7 +28,7 @@ class Figure4(suite.Experiment):
 def variants(job: Figure4, name: str) -> suite.Variants:
     """Methods and their options by the name of the run."""
     scenario = job.scenario_of(name)
-    chosen: suite.Variants = {method: (method, {}) for method in published.NAMES}
+    chosen: suite.Variants = {method: (method, {}) for method in paper_results.NAMES}
     for label, (method, factor) in SIZED.items():
         hidden = rewire_jax.preset(scenario, method, job.profile).sac.hidden
         chosen[label.lower()] = method, {"width": round(factor * hidden)}
@@ -46,7 +46,7 @@ def run(job: Figure4) -> None:
     runs = [r for name in job.scenarios for r in job.runs(name, variants(job, name))]
     reports = suite.reports(suite.train(runs, job), out)
     found = suite.averages(reports)
-    labels = published.NAMES | {label.lower(): label for label in SIZED}
+    labels = paper_results.NAMES | {label.lower(): label for label in SIZED}
     table, rows, points = [["method", "performance", "model size"]], [], []
     for name, label in labels.items():
         ours = found.get(name)

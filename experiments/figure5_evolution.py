@@ -12,8 +12,8 @@ import scipy
 
 from experiments import first_task, suite
 from experiments.first_task import FirstTask, Trained
-from rewire_jax.figures import Array
-from rewire_jax.numerals import number
+from rewire_jax.core.formatting import number
+from rewire_jax.reports.plots import Array
 
 # On the first task there is nothing to align with.
 VARIANTS: suite.Variants = {

@@ -10,7 +10,7 @@ from typing import Any
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.axes import grid
+from rewire_jax.run.sweep_grid import grid
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import suite
-from rewire_jax.config import require
-from rewire_jax.evolution import Curve, evolution
-from rewire_jax.figures import Array
-from rewire_jax.numerals import number
-from rewire_jax.report import heading
-from rewire_jax.rundata import RunData, read_progress, read_run
+from rewire_jax.core.formatting import number
+from rewire_jax.core.settings import require
+from rewire_jax.reports.plots import Array
+from rewire_jax.reports.titles import heading
+from rewire_jax.reports.training_curve_plot import Curve, evolution
+from rewire_jax.storage.run_results import RunData, read_progress, read_run
 
 READING = (
     "Over seeds; those that diverged have no part in it, nor have runs that are not "

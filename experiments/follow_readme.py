@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from experiments import suite
-from rewire_jax.config import require
-from rewire_jax.errors import UserError
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import require
 
 ROOT = Path(__file__).resolve().parent.parent
 LATER = "**For later"

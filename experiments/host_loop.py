@@ -18,10 +18,10 @@ import numpy as np
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.config import require
+from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
-from rewire_jax.lanes import Lanes
-from rewire_jax.plan import Plan, prepare
+from rewire_jax.envs.vector_env import Lanes
+from rewire_jax.training.run_setup import Plan, prepare
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """What a member needs of a device's memory, by method and number of environments.
 
-Nothing is trained or compiled: `rewire_jax.memory` counts it from shapes and traces.
+Nothing is trained or compiled: `rewire_jax.training.memory_estimate` counts it from
+shapes and traces.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,10 +11,10 @@ from typing import Any
 
 import rewire_jax
 from experiments import suite
-from rewire_jax import memory
 from rewire_jax.methods import METHODS
-from rewire_jax.plan import prepare
-from rewire_jax.published import NAMES
+from rewire_jax.reports.paper_results import NAMES
+from rewire_jax.training import memory_estimate
+from rewire_jax.training.run_setup import prepare
 
 SCENARIOS = ("halfcheetah/forgetting", "continual_world/t3")
 TITLE = "Memory of a member, in MB"
@@ -49,7 +50,7 @@ def count(scenario: rewire_jax.Scenario, method: str, envs: int = 0) -> dict[str
     """
     settings = replace(rewire_jax.preset(scenario, method), seeds=1)
     settings = replace(settings, envs=envs or settings.envs)
-    need = memory.need(prepare(settings, scenario))
+    need = memory_estimate.need(prepare(settings, scenario))
     return {
         "scenario": scenario.name,
         "method": method,
@@ -71,7 +72,7 @@ def rows(envs: Sequence[int]) -> Iterator[dict[str, Any]]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """A line for each row."""
-    parts = [*memory.Need._fields, "total"]
+    parts = [*memory_estimate.Need._fields, "total"]
     lines = [
         [row["scenario"], NAMES[row["method"]], str(row["envs"])]
         + [f"{row[part] / 1e6:.1f}" for part in parts]

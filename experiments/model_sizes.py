@@ -13,10 +13,10 @@ from typing import Any
 
 import rewire_jax
 from experiments import suite
-from rewire_jax import published
-from rewire_jax.inspection import most_stored
 from rewire_jax.methods import find_method
-from rewire_jax.plan import base_size, make_spec
+from rewire_jax.reports import paper_results
+from rewire_jax.run.evaluation import most_stored
+from rewire_jax.training.run_setup import base_size, make_spec
 
 # Length of observations in the brax v1 of the paper's runs, where it is known for
 # certain and another than in brax v2.
@@ -75,7 +75,7 @@ def measure(name: str) -> Iterator[dict[str, Any]]:
     """
     scenario = rewire_jax.make_scenario(name)
     environment = scenario.environment
-    paper = published.sources(name)[0].results
+    paper = paper_results.sources(name)[0].results
     lengths = [environment.observation_size, *FORMER.get(scenario.domain, ())]
     for length, method in itertools.product(lengths, FORMULAS):
         settings = rewire_jax.preset(scenario, method)
@@ -94,7 +94,10 @@ def measure(name: str) -> Iterator[dict[str, Any]]:
 
 def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Means over a domain's scenarios beside the paper's, a line for each method."""
-    head, lines = ["method"], {method: [published.NAMES[method]] for method in FORMULAS}
+    head, lines = (
+        ["method"],
+        {method: [paper_results.NAMES[method]] for method in FORMULAS},
+    )
     for domain in suite.DOMAINS:
         own = [row for row in rows if row["scenario"].startswith(domain)]
         lengths = dict.fromkeys(row["observations"] for row in own)

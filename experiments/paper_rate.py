@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 
 import rewire_jax
-from rewire_jax.runfolder import provenance
+from rewire_jax.storage.run_folder import provenance
 
 SCENARIOS = ("halfcheetah/forgetting", "ant/forgetting", "humanoid/hard")
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import suite
-from rewire_jax import published
-from rewire_jax.config import require
+from rewire_jax.core.settings import require
 from rewire_jax.methods import METHODS
-from rewire_jax.scores import Success
+from rewire_jax.reports import paper_results
+from rewire_jax.storage.scores import Success
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,12 +75,12 @@ def write(
     done = suite.train([run for runs in groups.values() for run in runs], job)
     head, reports, rows = ["method"], [], []
     methods = dict.fromkeys(r.folder.name for runs in groups.values() for r in runs)
-    lines = {method: [published.NAMES.get(method, method)] for method in methods}
+    lines = {method: [paper_results.NAMES.get(method, method)] for method in methods}
     for group, runs in groups.items():
         made = suite.reports([run for run in runs if run in done], path.parent, success)
         reports += made
         found = suite.averages(made)
-        sources = published.sources(runs[0].settings.scenario)
+        sources = paper_results.sources(runs[0].settings.scenario)
         sized = not sources or sources[0].sized
         head += [group, "model size", "paper"]
         head += ["paper's model size"] if sized else []

@@ -21,15 +21,17 @@ import jax.numpy as jnp
 
 import rewire_jax
 from experiments import suite
-from rewire_jax import figures, memory
-from rewire_jax.config import require
-from rewire_jax.plan import prepare
+from rewire_jax.core.settings import require
+from rewire_jax.reports import plots
+from rewire_jax.training import memory_estimate
+from rewire_jax.training.run_setup import prepare
 
 READING = (
     "A population is members side by side in one compiled function. Times are of "
     "training, environments and updates, in the best round; processor time is that of "
     "all threads. Planned is what the compiler plans for a chunk of training, "
-    "arguments and temporary arrays; estimated is what `rewire_jax.memory` counts for "
+    "arguments and temporary arrays; estimated is what "
+    "`rewire_jax.training.memory_estimate` counts for "
     "the same before anything is compiled. The peak is the process's, with all that "
     "compiling takes, or the device's where it has memory of its own. Compile time is "
     "that of a chunk, traced and without a cache of earlier compilations."
@@ -86,13 +88,13 @@ def measure(job: Population, members: int) -> dict[str, Any]:
         rounds.append((time.perf_counter() - began, time.process_time() - used))
         done += job.steps
     # The estimate's own traces are no part of the times.
-    need = memory.need(plan)
+    need = memory_estimate.need(plan)
     planned = chunk.memory_analysis()
     taken = members * job.steps * settings.envs
     wall, processor = (min(times) / taken for times in zip(*rounds, strict=True))
     return {
         "members": members,
-        "side_by_side": memory.fitting(need, jax.local_devices()),
+        "side_by_side": memory_estimate.fitting(need, jax.local_devices()),
         "compile_seconds": compiling[0],
         "compile_processor_seconds": compiling[1],
         "seconds": wall,
@@ -169,18 +171,18 @@ def headline(rows: Sequence[Mapping[str, Any]], key: str) -> list[str]:
 
 def draw(rows: Sequence[Mapping[str, Any]], key: str, path: Path) -> None:
     """Writes the picture: time per member against members."""
-    figure, (axes,) = figures.empty((7.0, 4.2), 1, 1)
+    figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
     members = [row["members"] for row in rows]
     times = [1e3 * row[key] for row in rows]
-    axes.plot(members, times, marker="o", **figures.look(0))
-    figures.doubling(axes, members)
+    axes.plot(members, times, marker="o", **plots.look(0))
+    plots.doubling(axes, members)
     axes.set_ylim(0, 1.1 * max(times))
     axes.set_xlabel("members side by side")
     axes.set_ylabel("ms a member and interaction")
     axes.grid(color="0.9")
     axes.set_axisbelow(True)
     clock = key.replace("_seconds", " time").replace("seconds", "wall clock")
-    figures.entitle(figure, f"Time per member, {jax.devices()[0].device_kind}", clock)
+    plots.entitle(figure, f"Time per member, {jax.devices()[0].device_kind}", clock)
     figure.savefig(path)
 
 

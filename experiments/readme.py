@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rewire_jax.errors import UserError
+from rewire_jax.core.errors import UserError
 
 PAGES = (Path("README.md"), Path("docs/results.md"), Path("docs/speed.md"))
 RESULTS = Path("experiments/results")

@@ -15,16 +15,16 @@ from typing import Any, NamedTuple, TypeVar
 import tyro
 
 import rewire_jax
-from rewire_jax.config import require
-from rewire_jax.errors import UserError
-from rewire_jax.plan import prepare
-from rewire_jax.published import Figures
-from rewire_jax.report import Report
-from rewire_jax.rundata import RunData, read_run
-from rewire_jax.runfolder import HEADER, TABLES, compare, provenance
-from rewire_jax.scores import Success
-from rewire_jax.summary import Summary
-from rewire_jax.tables import csv_text, json_text
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import require
+from rewire_jax.reports.paper_results import Figures
+from rewire_jax.reports.run_report import Report
+from rewire_jax.reports.run_summary import Summary
+from rewire_jax.reports.run_tables import csv_text, json_text
+from rewire_jax.storage.run_folder import HEADER, TABLES, compare, provenance
+from rewire_jax.storage.run_results import RunData, read_run
+from rewire_jax.storage.scores import Success
+from rewire_jax.training.run_setup import prepare
 
 T = TypeVar("T")
 Variants = dict[str, tuple[str, dict[str, Any]]]

@@ -7,9 +7,9 @@ sequences on Meta-World v3, the paper's are on v1.
 from dataclasses import dataclass
 
 from experiments import paper_table, suite
-from rewire_jax import published
-from rewire_jax.config import require
-from rewire_jax.scores import SUCCESS, Success
+from rewire_jax.core.settings import require
+from rewire_jax.reports import paper_results
+from rewire_jax.storage.scores import SUCCESS, Success
 
 CW10 = "continual_world/cw10"
 SCENARIOS = (*(f"continual_world/t{number}" for number in range(1, 9)), CW10)
@@ -50,7 +50,7 @@ def run(job: Table2) -> None:
     if settings.interactions < (settings.paper_interactions or 0):
         title += f", reduced budget (paper: {settings.paper_interactions:,})"
     score = SUCCESS[job.success]
-    (paper,) = published.sources(CW10)
+    (paper,) = paper_results.sources(CW10)
     reading = (
         f"Performance is the {score.noun}, averaged over tasks after the last of them; "
         f"{suite.AVERAGED} {score.evaluated} The paper's results are {paper.made}."

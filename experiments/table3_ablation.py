@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import rewire_jax
 from experiments import suite
-from rewire_jax import published
+from rewire_jax.reports import paper_results
 
 # By name of the run: marks for rewiring ("*": without caching), multi-mode and
 # alignment.
@@ -65,7 +65,7 @@ def run(job: Table3) -> None:
     head = ["rewire", "multi-mode", "alignment", "performance", "model size", "paper"]
     table, rows = [head], []
     for name, marks in ROWS.items():
-        ours, paper = found.get(name), published.ABLATION[name]
+        ours, paper = found.get(name), paper_results.ABLATION[name]
         cells = suite.text(ours), suite.size(ours), suite.text(paper)
         table.append([*marks, *cells])
         rows.append(

@@ -24,9 +24,9 @@ from experiments.faults import (
     versions,
 )
 from experiments.faults.base import Impossible, Kind
-from rewire_jax import runfolder
-from rewire_jax.config import require
-from rewire_jax.tables import markdown
+from rewire_jax.core.settings import require
+from rewire_jax.reports.run_tables import markdown
+from rewire_jax.storage import run_folder
 
 KINDS: dict[str, Kind] = {
     kind.name: kind
@@ -108,14 +108,14 @@ def run(job: Faults) -> None:
     """
     for name in job.kinds:
         require(name in KINDS, f"--kinds {name}: choose from {', '.join(KINDS)}")
-    runfolder.make(job.out.parent)
+    run_folder.make(job.out.parent)
     path = job.out.with_suffix(".json")
     found = json.loads(path.read_text()) if path.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         for name in job.kinds or KINDS:
             cases = attempt(KINDS[name], Path(folder))
-            found[name] = {"cases": cases, "provenance": runfolder.provenance()}
-            runfolder.write(path, found)
+            found[name] = {"cases": cases, "provenance": run_folder.provenance()}
+            run_folder.write(path, found)
             text = report(found)
             job.out.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)

@@ -4,19 +4,11 @@ Implements "Rewiring Neurons in Non-Stationary Environments" (NeurIPS 2023) and 
 it is compared with. The README has the commands; this is the interface for Python.
 """
 
-from rewire_jax.compilation import keep_compiled
-from rewire_jax.config import SacSettings, Settings
-from rewire_jax.continual import Stopped, train
+from rewire_jax.core.compilation_cache import keep_compiled
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import SacSettings, Settings
 from rewire_jax.envs.base import TaskChange
-from rewire_jax.errors import UserError
-from rewire_jax.inspection import evaluate, info
-from rewire_jax.methods import register_method
-from rewire_jax.permutation import permute
-from rewire_jax.policy import load_policies, load_policy
-from rewire_jax.presets import preset
-from rewire_jax.rendering import render
-from rewire_jax.report import write_report
-from rewire_jax.scenarios import (
+from rewire_jax.envs.scenarios import (
     Scenario,
     ScenarioSpec,
     list_scenarios,
@@ -24,8 +16,16 @@ from rewire_jax.scenarios import (
     register_domain,
     register_scenario,
 )
-from rewire_jax.sweeping import sweep
-from rewire_jax.sweepreport import write_sweep_report
+from rewire_jax.methods import register_method
+from rewire_jax.nn.permutation import permute
+from rewire_jax.rendering.render import render
+from rewire_jax.reports.run_report import write_report
+from rewire_jax.reports.sweep_report import write_sweep_report
+from rewire_jax.run.evaluation import evaluate, info
+from rewire_jax.run.policies import load_policies, load_policy
+from rewire_jax.run.sweep import sweep
+from rewire_jax.run.train_run import Stopped, train
+from rewire_jax.training.presets import preset
 from rewire_jax.version import __version__
 
 __all__ = [

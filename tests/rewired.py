@@ -8,7 +8,7 @@ import numpy as np
 from rewire_jax.methods import rewire as rewiring
 from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.methods.rewire import RewireSettings
-from rewire_jax.networks import Linear
+from rewire_jax.nn.networks import Linear
 
 OBSERVATIONS, ACTIONS, N, DEPTH, TASKS, SLOTS, K = 5, 2, 12, 2, 6, 3, 3
 SPEC = Spec(OBSERVATIONS, ACTIONS, N, DEPTH, TASKS)

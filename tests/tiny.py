@@ -3,8 +3,8 @@
 import dataclasses
 
 import rewire_jax
-from rewire_jax.config import Settings
-from rewire_jax.scenarios import Scenario, make_scenario
+from rewire_jax.core.settings import Settings
+from rewire_jax.envs.scenarios import Scenario, make_scenario
 
 
 def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Settings:

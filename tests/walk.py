@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rewire_jax.envs.base import Environment, HostEnvironment, State, Task
-from rewire_jax.scenarios import Scenario, ScenarioTask
+from rewire_jax.envs.scenarios import Scenario, ScenarioTask
 
 GOALS = ((0.5, 0.0), (-0.4, 0.4))
 LENGTH = 12

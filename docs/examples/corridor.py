@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax import ScenarioSpec, TaskChange, register_domain, register_scenario
-from rewire_jax.envs.base import Domain, Environment, State, Task
+from rewire_jax.envs import Domain, Environment, State, Task
 
 STRIDE = 0.1
 

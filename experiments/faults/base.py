@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import orbax.checkpoint as ocp
 
-from rewire_jax.runfolder import TABLES
+from rewire_jax.storage.run_folder import TABLES
 
 SETTINGS: dict[str, Any] = {
     "profile": "quick",
@@ -120,7 +120,7 @@ def environment() -> dict[str, str]:
 
 def words(arguments: Sequence[str | Path]) -> list[str]:
     """The whole command line of `rewire-jax` with these arguments."""
-    return [sys.executable, "-m", "rewire_jax.cli", *map(str, arguments)]
+    return [sys.executable, "-m", "rewire_jax.cli.main", *map(str, arguments)]
 
 
 def run(*arguments: str | Path, before: Sequence[str] = (), **others: str) -> Ran:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from experiments.faults import base
 from experiments.faults.base import TRAIN, Case, Kind, Outcome
-from rewire_jax.config import SacSettings, Settings, flag
+from rewire_jax.core.settings import SacSettings, Settings, flag
 from rewire_jax.methods import METHODS
 
 _SEED = 17

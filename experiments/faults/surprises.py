@@ -6,17 +6,17 @@ from pathlib import Path
 
 from experiments.faults import base
 from experiments.faults.base import Case, Kind, Outcome
-from rewire_jax import cli
+from rewire_jax.cli import main
 
 _BROKEN = """
 import sys
-from rewire_jax import cli
+from rewire_jax.cli import main
 
 def broken(arguments):
     raise RuntimeError("a surprise\\nof two lines")
 
-cli._COMMANDS = dict.fromkeys(cli._COMMANDS, broken)
-cli.main()
+main._COMMANDS = dict.fromkeys(main._COMMANDS, broken)
+main.main()
 """
 
 
@@ -41,6 +41,6 @@ KINDS = (
     Kind(
         "surprise",
         "an error that a command does not expect; --debug says where it is",
-        tuple(Case(name, partial(surprised, name)) for name in cli._COMMANDS),
+        tuple(Case(name, partial(surprised, name)) for name in main._COMMANDS),
     ),
 )

@@ -15,7 +15,7 @@ from typing import Any
 import rewire_jax
 from experiments.faults import base, damage
 from experiments.faults.base import TRAIN, Case, Kind, Outcome
-from rewire_jax.runfolder import HEADER, TABLES
+from rewire_jax.storage.run_folder import HEADER, TABLES
 
 OTHER = "98.7.6"
 _EPISODES = ("--episodes", "4", "--json")

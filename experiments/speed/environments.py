@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from experiments.host_loop import simulate
 from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.timing import Loop, in_turn
-from rewire_jax import figures
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.lanes import Lanes
-from rewire_jax.scenarios import BRAX_BACKENDS, make_scenario
+from rewire_jax.envs.scenarios import BRAX_BACKENDS, make_scenario
+from rewire_jax.envs.vector_env import Lanes
+from rewire_jax.reports import plots
 
 BRAX = "halfcheetah/forgetting"
 COUNTS: tuple[int, ...] = (1, 64, 256)
@@ -99,7 +99,7 @@ def draw(axes: Axes, rows: list[Row]) -> None:
             [row["steps_per_second"] for row in own],
             marker="o",
             label=" ".join(group),
-            **figures.look(i),
+            **plots.look(i),
         )
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")

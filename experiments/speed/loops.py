@@ -17,11 +17,11 @@ from matplotlib.axes import Axes
 from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.timing import Loop, Timing, in_turn
 from experiments.speed.updates import METHODS, draw_batches, update_loop
-from rewire_jax import figures
-from rewire_jax.config import Settings
-from rewire_jax.plan import prepare
-from rewire_jax.replay import Batch
-from rewire_jax.scenarios import make_scenario
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.transition import Batch
+from rewire_jax.envs.scenarios import make_scenario
+from rewire_jax.reports import plots
+from rewire_jax.training.run_setup import prepare
 
 OURS = "rewire_jax"
 
@@ -164,7 +164,7 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     rows = [row for row in rows if "whole" in row]
     names = [f"{row['name']}, {row['policy']}, {row['delay']}" for row in rows]
     rates = [row["interactions_per_second"] for row in rows]
-    colours = [figures.look(int(row["name"] != OURS))["color"] for row in rows]
+    colours = [plots.look(int(row["name"] != OURS))["color"] for row in rows]
     axes.barh(names, rates, color=colours)
     axes.invert_yaxis()
     axes.set_xlabel("interactions a second, with all their updates")

@@ -4,9 +4,9 @@ from matplotlib.axes import Axes
 
 from experiments import population
 from experiments.speed.part import Effort, Part, Row, show
-from rewire_jax import figures
-from rewire_jax.presets import preset
-from rewire_jax.scenarios import make_scenario
+from rewire_jax.envs.scenarios import make_scenario
+from rewire_jax.reports import plots
+from rewire_jax.training.presets import preset
 
 MEMBERS = (1, 8, 32, 128)
 SCENARIO = "probe/reach"
@@ -32,8 +32,8 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     """Updates a second of all members together."""
     members = [row["members"] for row in rows]
     rates = [row["updates_per_second"] for row in rows]
-    axes.plot(members, rates, marker="o", **figures.look(0))
-    figures.doubling(axes, members)
+    axes.plot(members, rates, marker="o", **plots.look(0))
+    plots.doubling(axes, members)
     axes.set_ylim(0, None)
     axes.set_xlabel("members side by side")
     axes.set_ylabel("updates a second, all together")

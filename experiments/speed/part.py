@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
 
-from rewire_jax.config import Settings
-from rewire_jax.presets import preset
-from rewire_jax.scenarios import make_scenario
+from rewire_jax.core.settings import Settings
+from rewire_jax.envs.scenarios import make_scenario
+from rewire_jax.training.presets import preset
 
 Row = dict[str, Any]
 

@@ -15,10 +15,10 @@ from rejax import SAC
 from rejax.buffers import Minibatch
 
 from experiments.speed.timing import Loop
-from rewire_jax import rollout
-from rewire_jax.config import Settings
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.transition import Batch
 from rewire_jax.envs.base import Environment, Task
-from rewire_jax.replay import Batch
+from rewire_jax.training import rollout
 
 
 class Adapter(Gymnax):

@@ -13,9 +13,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from experiments.speed.timing import Loop
 from experiments.speed.vector import Vector
-from rewire_jax.config import Settings
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.transition import Batch
 from rewire_jax.envs.base import Environment, Task
-from rewire_jax.replay import Batch
 
 
 class Adapter(VecEnv):

@@ -17,9 +17,9 @@ from torch.nn import functional
 
 from experiments.speed.timing import Loop
 from experiments.speed.vector import Vector
-from rewire_jax.config import Settings
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.transition import Batch
 from rewire_jax.envs.base import Environment, Task
-from rewire_jax.replay import Batch
 
 Transitions = tuple[Tensor, ...]
 """Observations, actions, rewards, ends, next observations."""

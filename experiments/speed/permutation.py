@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 
 from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.timing import Loop, in_turn
-from rewire_jax import figures
-from rewire_jax.permutation import permute
+from rewire_jax.nn.permutation import permute
+from rewire_jax.reports import plots
 
 BATCH = 256
 TAU = 1.0
@@ -77,8 +77,8 @@ def draw(axes: Axes, rows: list[Row]) -> None:
         (("permute", "permute"), ("dense", "dense form"))
     ):
         times = [row[f"{name}_ms"] for row in rows]
-        axes.plot(widths, times, marker="o", label=label, **figures.look(i))
-    figures.doubling(axes, widths)
+        axes.plot(widths, times, marker="o", label=label, **plots.look(i))
+    plots.doubling(axes, widths)
     axes.set_yscale("log")
     axes.set_xlabel("neurons")
     axes.set_ylabel("ms, forward and backward")

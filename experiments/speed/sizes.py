@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.timing import in_turn
 from experiments.speed.updates import METHODS, update_loop
-from rewire_jax import figures
+from rewire_jax.reports import plots
 
 MODES = (1, 3, 5)
 WIDTHS = (128, 256, 512, 1024, 2048, 4096)
@@ -45,8 +45,8 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     rows.sort(key=lambda row: row["hidden"])
     widths = [row["hidden"] for row in rows]
     costs = [row["cost"] for row in rows]
-    axes.plot(widths, costs, marker="o", **figures.look(0))
-    figures.doubling(axes, widths)
+    axes.plot(widths, costs, marker="o", **plots.look(0))
+    plots.doubling(axes, widths)
     axes.set_ylim(0, None)
     axes.set_xlabel("neurons in a hidden layer")
     axes.set_ylabel("cost of a rewire update, in plain ones")

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from experiments.speed.part import Effort, Part, Row, show
-from rewire_jax.config import require
+from rewire_jax.core.settings import require
 
 SETTINGS = {
     "profile": "quick",
@@ -37,7 +37,7 @@ def first_report(scenario: str, folder: Path, cache: Path) -> float:
     began = time.perf_counter()
     settings = SETTINGS | {"out": folder, "cache": cache}
     flags = [f"--{name}={value}" for name, value in settings.items()]
-    train = [sys.executable, "-m", "rewire_jax.cli", "train", scenario]
+    train = [sys.executable, "-m", "rewire_jax.cli.main", "train", scenario]
     process = subprocess.Popen([*train, *flags], stdout=subprocess.DEVNULL)
     report = folder / "training.jsonl"
     try:

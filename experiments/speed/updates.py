@@ -9,12 +9,12 @@ import jax.numpy as jnp
 from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.products import SQUARE, multiply_adds, product_loop, products
 from experiments.speed.timing import Loop, in_turn
-from rewire_jax import sac
-from rewire_jax.config import Settings
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.transition import Batch
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec
-from rewire_jax.plan import prepare
-from rewire_jax.replay import Batch
+from rewire_jax.training import sac
+from rewire_jax.training.run_setup import prepare
 
 METHODS = {"plain": "ft1", "rewire": "rewire"}
 

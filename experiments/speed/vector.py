@@ -6,8 +6,8 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rewire_jax import rollout
 from rewire_jax.envs.base import Environment, Task
+from rewire_jax.training import rollout
 
 Array = NDArray[np.float32]
 

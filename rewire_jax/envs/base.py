@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from rewire_jax.film import Film
+from rewire_jax.envs.geom_trajectory import Film
 
 
 class Task(NamedTuple):

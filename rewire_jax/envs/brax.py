@@ -21,9 +21,9 @@ from brax.base import System, Transform
 from brax.envs.base import PipelineEnv
 from brax.envs.base import State as BraxState
 
-from rewire_jax.envs import changes
+from rewire_jax.envs import task_parameters
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
-from rewire_jax.film import Film
+from rewire_jax.envs.geom_trajectory import Film
 
 NAMES = ("halfcheetah", "ant", "humanoid")
 BACKENDS = ("positional", "spring", "generalized", "mjx")
@@ -55,8 +55,8 @@ def make_domain(name: str, backend: str = "positional") -> Domain:
     Raises:
       UserError: no such name or backend.
     """
-    changes.check_names("Brax domain", [name], NAMES)
-    changes.check_names("Brax backend", [backend], BACKENDS)
+    task_parameters.check_names("Brax domain", [name], NAMES)
+    task_parameters.check_names("Brax backend", [backend], BACKENDS)
     return _make_domain(name, backend)
 
 
@@ -74,11 +74,11 @@ def _make_domain(name: str, backend: str) -> Domain:
     ]
 
     def make_task(change: TaskChange) -> Task:
-        changes.check_physics(change, list(bodies))
+        task_parameters.check_physics(change, list(bodies))
         return Task(
             physics=_change_system(system, change, bodies, _RESIZED[name]),
-            action_scale=changes.action_scale(joints, change.actions),
-            observation_mask=changes.observation_mask(
+            action_scale=task_parameters.action_scale(joints, change.actions),
+            observation_mask=task_parameters.observation_mask(
                 environment.observation_size, change.hidden
             ),
         )

@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rewire_jax.envs import brax_v1_shim, changes
+from rewire_jax.envs import brax_v1_shim, task_parameters
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
-from rewire_jax.film import Film
+from rewire_jax.envs.geom_trajectory import Film
 
 EPISODE_LENGTH = 1000
 
@@ -63,11 +63,11 @@ def make_domain(name: str) -> Domain:
     joints = _joint_of_each_action(systems.config)
 
     def make_task(change: TaskChange) -> Task:
-        changes.check_physics(change, list(systems.bodies))
+        task_parameters.check_physics(change, list(systems.bodies))
         return Task(
             physics=systems.physics(change),
-            action_scale=changes.action_scale(joints, change.actions),
-            observation_mask=changes.observation_mask(
+            action_scale=task_parameters.action_scale(joints, change.actions),
+            observation_mask=task_parameters.observation_mask(
                 environment.observation_size, change.hidden
             ),
         )

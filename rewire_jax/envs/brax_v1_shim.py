@@ -14,7 +14,7 @@ from types import ModuleType
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.errors import UserError
+from rewire_jax.core.errors import UserError
 
 NEEDED = "0.12.3"
 

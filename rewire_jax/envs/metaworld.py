@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 
-from rewire_jax.envs import changes
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs import task_parameters
 from rewire_jax.envs.base import Domain, Task, TaskChange
-from rewire_jax.errors import UserError
 
 BACKENDS = ("mujoco", "mjx")
 REWARDS = ("v1", "v2")
@@ -40,8 +40,8 @@ def make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
     Raises:
       UserError: no such backend, reward or task, or the backend is not installed.
     """
-    changes.check_names("Meta-World backend", [backend], BACKENDS)
-    changes.check_names("Meta-World reward", [reward], REWARDS)
+    task_parameters.check_names("Meta-World backend", [backend], BACKENDS)
+    task_parameters.check_names("Meta-World reward", [reward], REWARDS)
     return _make_domain(backend, reward, tuple(names))
 
 
@@ -62,9 +62,11 @@ def _make_task(names: Sequence[str], change: TaskChange) -> Task:
             f" {dict(change.extra)}."
         )
     name = change.extra["task"]
-    changes.check_names("Meta-World task of this domain", [name], names)
+    task_parameters.check_names("Meta-World task of this domain", [name], names)
     return Task(
         physics=jnp.asarray(names.index(name), jnp.int32),
-        action_scale=changes.action_scale(JOINTS, change.actions),
-        observation_mask=changes.observation_mask(OBSERVATION_SIZE, change.hidden),
+        action_scale=task_parameters.action_scale(JOINTS, change.actions),
+        observation_mask=task_parameters.observation_mask(
+            OBSERVATION_SIZE, change.hidden
+        ),
     )

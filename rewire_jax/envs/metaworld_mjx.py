@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from rewire_jax.envs import branches, changes
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs import batched_switch, task_parameters
 from rewire_jax.envs.base import Environment, State, Task
 from rewire_jax.envs.metaworld import EPISODE_LENGTH, JOINTS, OBSERVATION_SIZE
-from rewire_jax.errors import UserError
 
 try:
     import warp
@@ -108,7 +108,7 @@ def make_environment(reward: str, names: tuple[str, ...]) -> Environment:
             f"Meta-World on MJX-Warp has no reward {reward!r}: choose --reward v2 or"
             " --backend mujoco."
         )
-    changes.check_names("Meta-World task", names, NAMES)
+    task_parameters.check_names("Meta-World task", names, NAMES)
     simulators = [make_simulator(name) for name in names]
     length = max(len(ravel_pytree(simulator.scene)[0]) for simulator in simulators)
 
@@ -129,8 +129,10 @@ def make_environment(reward: str, names: tuple[str, ...]) -> Environment:
 
         return step
 
-    any_reset = branches.switch([resetting(simulator) for simulator in simulators])
-    any_step = branches.switch([stepping(simulator) for simulator in simulators])
+    any_reset = batched_switch.switch(
+        [resetting(simulator) for simulator in simulators]
+    )
+    any_step = batched_switch.switch([stepping(simulator) for simulator in simulators])
 
     def masked(task: Task, moved: tuple[jax.Array, ...]) -> State:
         inner, observation, reward, success = moved

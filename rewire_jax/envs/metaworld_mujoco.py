@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from rewire_jax.envs import changes
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs import task_parameters
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.envs.metaworld import EPISODE_LENGTH, JOINTS, OBSERVATION_SIZE
-from rewire_jax.errors import UserError
 
 try:
     import gymnasium
@@ -36,7 +36,7 @@ def make_environment(reward: str, names: tuple[str, ...]) -> HostEnvironment:
     Raises:
       UserError: no such task.
     """
-    changes.check_names("Meta-World task", names, NAMES)
+    task_parameters.check_names("Meta-World task", names, NAMES)
     return HostEnvironment(
         make=functools.partial(Simulator, names, reward),
         observation_size=OBSERVATION_SIZE,

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.envs import changes
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs import task_parameters
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
-from rewire_jax.errors import UserError
 
 REACH_STRIDE = 0.1
 _Moved = tuple[jax.Array, jax.Array, jax.Array]
@@ -64,7 +64,7 @@ def make_domain(name: str) -> Domain:
     Raises:
       UserError: no such probe.
     """
-    changes.check_names("probe", [name], list(_PROBES))
+    task_parameters.check_names("probe", [name], list(_PROBES))
     return _make_domain(name)
 
 
@@ -95,8 +95,8 @@ def _make_domain(name: str) -> Domain:
             )
         return Task(
             physics=_goal(name, change),
-            action_scale=changes.action_scale(probe.joints, change.actions),
-            observation_mask=changes.observation_mask(size, change.hidden),
+            action_scale=task_parameters.action_scale(probe.joints, change.actions),
+            observation_mask=task_parameters.observation_mask(size, change.hidden),
         )
 
     environment = Environment(

@@ -1,64 +1,45 @@
-"""The methods by name."""
+"""The methods, and what one of your own is made of."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from rewire_jax.core.settings import flag, require, settings, static, traced
+from rewire_jax.methods.base import (
+    Candidates,
+    Method,
+    Selection,
+    Shared,
+    Spec,
+    Tools,
+    at,
+    count,
+    put,
+    tile,
+)
+from rewire_jax.methods.finetune import FinetuneSettings, ft1, ft_n, sac_n
+from rewire_jax.methods.registry import METHODS, Entry, find_method, register_method
+from rewire_jax.nn import networks
 
-from rewire_jax.errors import UserError
-from rewire_jax.methods import finetune, packnet, progressive, regularize, subspace
-from rewire_jax.methods import rewire as rewiring
-from rewire_jax.methods.base import Method, Spec
-
-
-class Entry(NamedTuple):
-    """How a method is made.
-
-    Attributes:
-      make: `(spec, settings) -> Method`.
-      settings: its settings class, made with `config.settings`; `checked()` gives
-        settings ready to use or raises `UserError`.
-      preset: `(scenario name, period, profile) -> settings`; tasks recur after
-        `period` places.
-      selection_episodes: that each of its candidates is played by default; None for
-        the profile's number.
-      together: makes the settings of members of one population alike in all that
-        shapes the program.
-    """
-
-    make: Callable[[Spec, Any], Method]
-    settings: type
-    preset: Callable[[str, int, str], Any]
-    selection_episodes: int | None = None
-    together: Callable[[Sequence[Any]], list[Any]] = list
-
-
-# In the order of the paper's Table 1.
-METHODS: dict[str, Entry] = {
-    "ft1": Entry(finetune.ft1, finetune.FinetuneSettings, finetune.preset),
-    "ft_l2": Entry(regularize.ft_l2, regularize.FtL2Settings, regularize.preset_ft_l2),
-    "packnet": Entry(packnet.packnet, packnet.PackNetSettings, packnet.preset),
-    "ewc": Entry(regularize.ewc, regularize.EwcSettings, regularize.preset_ewc),
-    "pnn": Entry(progressive.pnn, progressive.PnnSettings, progressive.preset),
-    "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
-    "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
-    "csp": Entry(subspace.csp, subspace.CspSettings, subspace.preset, 1),
-    "rewire": Entry(
-        rewiring.rewire,
-        rewiring.RewireSettings,
-        rewiring.preset,
-        together=rewiring.together,
-    ),
-}
-
-
-def register_method(name: str, entry: Entry) -> None:
-    """Adds a method of one's own, usable by name wherever the others are."""
-    METHODS[name] = entry
-
-
-def find_method(name: str) -> Entry:
-    """The method of that name; `UserError` if there is none."""
-    if name not in METHODS:
-        raise UserError(
-            f"unknown method {name!r}: choose one of {', '.join(sorted(METHODS))}"
-        )
-    return METHODS[name]
+__all__ = [
+    "METHODS",
+    "Candidates",
+    "Entry",
+    "FinetuneSettings",
+    "Method",
+    "Selection",
+    "Shared",
+    "Spec",
+    "Tools",
+    "at",
+    "count",
+    "find_method",
+    "flag",
+    "ft1",
+    "ft_n",
+    "networks",
+    "put",
+    "register_method",
+    "require",
+    "sac_n",
+    "settings",
+    "static",
+    "tile",
+    "traced",
+]

@@ -6,8 +6,8 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.config import SacSettings
-from rewire_jax.replay import Batch
+from rewire_jax.core.settings import SacSettings
+from rewire_jax.core.transition import Batch
 
 Params = Any
 """Pytree that the policy's optimiser trains."""

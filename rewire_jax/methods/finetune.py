@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax import networks
-from rewire_jax.config import settings
+from rewire_jax.core.settings import settings
 from rewire_jax.methods.base import Method, Spec, at, count, put, tile
+from rewire_jax.nn import networks
 
 
 @settings

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from rewire_jax import networks
-from rewire_jax.config import require, settings, static
+from rewire_jax.core.settings import require, settings, static
 from rewire_jax.methods.base import Method, Spec, count
+from rewire_jax.nn import networks
 
 FREE = -1
 """Owner of the weights that no task has kept."""

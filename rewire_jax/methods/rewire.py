@@ -7,11 +7,11 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax import networks
-from rewire_jax.config import require, settings, static, traced
+from rewire_jax.core.settings import require, settings, static, traced
 from rewire_jax.methods import wiring
 from rewire_jax.methods.base import Candidates, Method, Spec, at, count, put, tile
-from rewire_jax.networks import Linear
+from rewire_jax.nn import networks
+from rewire_jax.nn.networks import Linear
 
 # The authors' distillation sums over both states of each of 256 transitions, and
 # the published alpha belongs to that sum.

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from rewire_jax.networks import Linear, affine
-from rewire_jax.permutation import permute, permute_rows
+from rewire_jax.nn.networks import Linear, affine
+from rewire_jax.nn.permutation import permute, permute_rows
 
 Hidden = Sequence[Linear]
 

@@ -1,0 +1,356 @@
+"""Sequences of tasks, as data: the paper's scenarios and one probe."""
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs import metaworld, probe
+from rewire_jax.envs.base import Domain, Environment, HostEnvironment, Task, TaskChange
+from rewire_jax.envs.task_parameters import check_names
+
+
+@dataclass(frozen=True)
+class ScenarioSpec:
+    """A scenario before anything is built.
+
+    Attributes:
+      name: what it is called, `"domain/kind"` by custom.
+      domain: `"halfcheetah"`, `"ant"`, `"humanoid"`, `"metaworld"` or a probe's name.
+      changes: the tasks in order; equal changes are the same task, met again.
+      repeats: how often the whole list is gone through.
+      interactions: environment steps of training for each task.
+
+    Raises:
+      UserError: a value that no scenario can have.
+    """
+
+    name: str
+    domain: str
+    changes: tuple[TaskChange, ...]
+    repeats: int
+    interactions: int
+
+    def __post_init__(self) -> None:
+        if self.domain not in DOMAINS:
+            raise UserError(_unknown("domain", self.domain, list(DOMAINS)))
+        if not self.changes:
+            raise UserError(f"Scenario {self.name!r} needs at least one change.")
+        if self.repeats < 1:
+            raise UserError(
+                f"Scenario {self.name!r} needs repeats >= 1, not {self.repeats}."
+            )
+        if self.interactions < 1:
+            raise UserError(
+                f"Scenario {self.name!r} needs interactions >= 1, not"
+                f" {self.interactions}."
+            )
+        named = {change.name: change for change in self.changes}
+        if any(named[change.name] != change for change in self.changes):
+            raise UserError(f"Scenario {self.name!r} gives one name to two tasks.")
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioTask:
+    """One place in a sequence.
+
+    Attributes:
+      name: the task's name.
+      distinct: which of the scenario's distinct tasks it is, counted from 0.
+      data: what the environment takes; the same object wherever the task recurs.
+    """
+
+    name: str
+    distinct: int
+    data: Task
+
+    @property
+    def action_scale(self) -> np.ndarray:
+        """`[actions]`."""
+        return np.asarray(self.data.action_scale)
+
+    @property
+    def observation_mask(self) -> np.ndarray:
+        """`[observations]`."""
+        return np.asarray(self.data.observation_mask)
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A scenario that can be run.
+
+    Attributes:
+      name: of its spec.
+      domain: name of its domain.
+      backend: physics backend, `"probe"` for a probe.
+      reward: version of the rewards, where the domain has several.
+      environment: shared by all tasks; identical for one domain and backend.
+      tasks: the whole sequence, repeats included.
+      distinct: number of distinct tasks.
+      interactions: environment steps of training for each task.
+    """
+
+    name: str
+    domain: str
+    backend: str
+    reward: str
+    environment: Environment | HostEnvironment
+    tasks: tuple[ScenarioTask, ...]
+    distinct: int
+    interactions: int
+
+
+def make_scenario(
+    spec: ScenarioSpec | str, backend: str | None = None, reward: str = "v2"
+) -> Scenario:
+    """Builds a scenario.
+
+    Args:
+      spec: a spec, or the name of a known one.
+      backend: physics backend, the domain's first if None; probes and
+        domains of one's own ignore it.
+      reward: version of Meta-World's rewards, `"v1"` or `"v2"`; others ignore it.
+
+    Returns:
+      The scenario, its tasks ready for the environment.
+
+    Raises:
+      UserError: an unknown scenario, backend, reward, body or joint.
+    """
+    if isinstance(spec, str):
+        if spec not in SCENARIOS:
+            raise UserError(_unknown("scenario", spec, list(SCENARIOS)))
+        spec = SCENARIOS[spec]
+    kind = DOMAINS[spec.domain]
+    if backend is None or kind.backend in ("probe", "own"):
+        backend = kind.backend
+    domain = kind.make(spec, backend, reward)
+    names = list(dict.fromkeys(change.name for change in spec.changes))
+    changes = {change.name: change for change in spec.changes}
+    data = {name: domain.make_task(changes[name]) for name in names}
+    once = [
+        ScenarioTask(change.name, names.index(change.name), data[change.name])
+        for change in spec.changes
+    ]
+    return Scenario(
+        name=spec.name,
+        domain=spec.domain,
+        backend=backend,
+        reward=reward,
+        environment=domain.environment,
+        tasks=tuple(once * spec.repeats),
+        distinct=len(names),
+        interactions=spec.interactions,
+    )
+
+
+def register_scenario(spec: ScenarioSpec) -> None:
+    """Makes `spec` known by its name; the same spec may come again.
+
+    Raises:
+      UserError: another scenario has that name.
+    """
+    if SCENARIOS.get(spec.name, spec) != spec:
+        raise UserError(f"There is another scenario named {spec.name!r}.")
+    SCENARIOS[spec.name] = spec
+
+
+def register_domain(name: str, domain: Domain) -> None:
+    """Adds a domain of one's own, for specs to name; one of that name gives way."""
+    DOMAINS[name] = DomainKind(lambda spec, backend, reward: domain, "own")
+
+
+def list_scenarios() -> tuple[str, ...]:
+    """The names of all known scenarios, sorted."""
+    return tuple(sorted(SCENARIOS))
+
+
+def _unknown(kind: str, name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=3)
+    hint = f" Did you mean {' or '.join(close)}?" if close else ""
+    return f"Unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}."
+
+
+class DomainKind(NamedTuple):
+    """How a domain is made.
+
+    Attributes:
+      make: `(spec, backend, reward) -> Domain`.
+      backend: that it is made for where none is named; "probe" and "own" are the only
+        one of theirs.
+    """
+
+    make: Callable[[ScenarioSpec, str, str], Domain]
+    backend: str
+
+
+BRAX_BACKENDS = ("v1", "positional", "spring", "generalized", "mjx")
+
+
+def _make_brax(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
+    check_names("Brax backend", [backend], BRAX_BACKENDS)
+    # Brax takes seconds to import, and most commands do not need it.
+    if backend == "v1":
+        from rewire_jax.envs import brax_v1
+
+        return brax_v1.make_domain(spec.domain)
+    from rewire_jax.envs import brax
+
+    return brax.make_domain(spec.domain, backend)
+
+
+def _make_metaworld(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
+    names = dict.fromkeys(str(change.extra.get("task")) for change in spec.changes)
+    return metaworld.make_domain(backend, reward, tuple(names))
+
+
+def _make_probe(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
+    return probe.make_domain(spec.domain)
+
+
+DOMAINS: dict[str, DomainKind] = {
+    "halfcheetah": DomainKind(_make_brax, "v1"),
+    "ant": DomainKind(_make_brax, "v1"),
+    "humanoid": DomainKind(_make_brax, "v1"),
+    "metaworld": DomainKind(_make_metaworld, "mujoco"),
+    **dict.fromkeys(probe.NAMES, DomainKind(_make_probe, "probe")),
+}
+
+_NORMAL = TaskChange("normal")
+_INVERTED = TaskChange("inverted_actions", actions={"*": -1.0})
+_HUGE_FEET = {"bfoot": 1.5, "ffoot": 1.5}
+_TINY_FEET = {"bfoot": 0.5, "ffoot": 0.5}
+
+_HALFCHEETAH = {
+    change.name: change
+    for change in (
+        _NORMAL,
+        _INVERTED,
+        TaskChange("carry_stuff", bodies={"torso": 4.0}),
+        TaskChange("carry_stuff_hugegravity", bodies={"torso": 4.0}, gravity=1.5),
+        TaskChange("defective_module", hidden=0.5),
+        TaskChange("hugefoot", bodies=_HUGE_FEET),
+        TaskChange("hugefoot_rainfall", bodies=_HUGE_FEET, friction=0.4),
+        TaskChange("tinyfoot", bodies=_TINY_FEET),
+        TaskChange("tinyfoot_moon", bodies=_TINY_FEET, gravity=0.15),
+        TaskChange("moon", gravity=0.15),
+        TaskChange("rainfall", friction=0.4),
+    )
+}
+
+
+def _without_legs(name: str, *legs: int) -> TaskChange:
+    """Ant with dead legs: 1 front left, 2 front right, 3 back left, 4 back right."""
+    joints = [f"{joint}_{leg}" for leg in legs for joint in ("hip", "ankle")]
+    return TaskChange(name, actions=dict.fromkeys(joints, 0.0))
+
+
+_ANT = {
+    change.name: change
+    for change in (
+        _NORMAL,
+        _INVERTED,
+        TaskChange("hugefoot", bodies={f"lower_leg_{i}": 1.5 for i in (1, 2, 3, 4)}),
+        TaskChange("moon", gravity=0.7),
+        TaskChange("rainfall", friction=0.375),
+        _without_legs("disabled_hard1", 2, 3, 4),
+        _without_legs("disabled_hard2", 1, 3, 4),
+        _without_legs("disabled_forefeet", 1, 2),
+        _without_legs("disabled_backfeet", 3, 4),
+        _without_legs("disabled_first_diagonal", 1, 3),
+        _without_legs("disabled_second_diagonal", 2, 4),
+    )
+}
+
+_HUMANOID = {
+    change.name: change
+    for change in (
+        _NORMAL,
+        TaskChange("moon", gravity=0.15),
+        TaskChange("carrystuff", bodies={"torso": 4.0, "lwaist": 4.0}),
+        TaskChange("tinyfeet", bodies={"right_shin": 0.5, "left_shin": 0.5}),
+    )
+}
+
+# Goals in opposite corners follow each other: what serves one harms the next.
+_REACH = {
+    name: TaskChange(name, extra={"goal": goal})
+    for name, goal in (
+        ("northeast", (0.5, 0.5)),
+        ("southwest", (-0.5, -0.5)),
+        ("northwest", (-0.5, 0.5)),
+        ("southeast", (0.5, -0.5)),
+    )
+}
+
+# By domain: its tasks by name, repeats of each list, interactions a task.
+_BRAX = {
+    "halfcheetah": (_HALFCHEETAH, 2, 1_000_000),
+    "ant": (_ANT, 2, 1_000_000),
+    "humanoid": (_HUMANOID, 1, 2_000_000),
+}
+
+
+def _brax_spec(name: str, tasks: str) -> ScenarioSpec:
+    domain = name.split("/")[0]
+    known, repeats, interactions = _BRAX[domain]
+    changes = tuple(known[task] for task in tasks.split())
+    return ScenarioSpec(name, domain, changes, repeats, interactions)
+
+
+def _continual_world_spec(name: str, tasks: str) -> ScenarioSpec:
+    changes = tuple(TaskChange(task, extra={"task": task}) for task in tasks.split())
+    return ScenarioSpec(f"continual_world/{name}", "metaworld", changes, 1, 1_000_000)
+
+
+SCENARIOS: dict[str, ScenarioSpec] = {}
+for _name, _tasks in (
+    ("halfcheetah/forgetting", "hugefoot moon carry_stuff rainfall"),
+    (
+        "halfcheetah/transfer",
+        "carry_stuff_hugegravity moon defective_module hugefoot_rainfall",
+    ),
+    ("halfcheetah/robustness", "normal inverted_actions normal inverted_actions"),
+    (
+        "halfcheetah/compositionality",
+        "tinyfoot moon carry_stuff_hugegravity tinyfoot_moon",
+    ),
+    ("ant/forgetting", "normal hugefoot rainfall moon"),
+    (
+        "ant/transfer",
+        "disabled_first_diagonal disabled_second_diagonal"
+        " disabled_forefeet disabled_backfeet",
+    ),
+    ("ant/robustness", "normal inverted_actions normal inverted_actions"),
+    (
+        "ant/compositionality",
+        "disabled_hard1 disabled_hard2 disabled_forefeet disabled_backfeet",
+    ),
+    ("humanoid/hard", "normal moon carrystuff tinyfeet"),
+):
+    register_scenario(_brax_spec(_name, _tasks))
+for _name, _tasks in (
+    ("t1", "push window-close hammer"),
+    ("t2", "hammer window-close faucet-close"),
+    ("t3", "window-close handle-press-side peg-unplug-side"),
+    ("t4", "faucet-close shelf-place peg-unplug-side"),
+    ("t5", "faucet-close shelf-place push-back"),
+    ("t6", "stick-pull peg-unplug-side stick-pull"),
+    ("t7", "stick-pull push-back push-wall"),
+    ("t8", "push-wall shelf-place push-back"),
+    (
+        "cw10",
+        "hammer push-wall faucet-close push-back stick-pull handle-press-side push"
+        " shelf-place window-close peg-unplug-side",
+    ),
+):
+    register_scenario(_continual_world_spec(_name, _tasks))
+# Each task alone: what transfer to it is measured against.
+for _change in SCENARIOS["continual_world/cw10"].changes:
+    register_scenario(_continual_world_spec(_change.name, _change.name))
+register_scenario(
+    ScenarioSpec("probe/reach", "reach", tuple(_REACH.values()), 1, 10_000)
+)

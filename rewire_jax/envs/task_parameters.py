@@ -1,0 +1,76 @@
+"""The parts of a `TaskChange` that mean the same in several domains."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs.base import TaskChange
+
+ALL_JOINTS = "*"
+
+
+def action_scale(joints: Sequence[str], factors: Mapping[str, float]) -> jax.Array:
+    """Factors by joint name, put into the environment's own action order.
+
+    Args:
+      joints: the joint that each action drives, in action order.
+      factors: joint name -> factor; `"*"` is every joint; a joint that both
+        name gets the product.
+
+    Returns:
+      `[actions]` float32.
+
+    Raises:
+      UserError: a name is neither a joint nor `"*"`.
+    """
+    check_names("joint", factors, [*joints, ALL_JOINTS])
+    everywhere = factors.get(ALL_JOINTS, 1.0)
+    scale = [everywhere * factors.get(joint, 1.0) for joint in joints]
+    return jnp.asarray(np.array(scale, np.float32))
+
+
+def observation_mask(size: int, hidden: float) -> jax.Array:
+    """Masks the share `hidden` of an observation, rounded down, by a fixed draw.
+
+    The draw is numpy's legacy `permutation` at seed 0 of the zeros followed by
+    the ones, as the paper's tasks were drawn.
+
+    Args:
+      size: length of the observation.
+      hidden: share of the entries to hide, in [0, 1].
+
+    Returns:
+      `[size]` float32 of zeros and ones.
+
+    Raises:
+      UserError: `hidden` is not a share.
+    """
+    if not 0 <= hidden <= 1:
+        raise UserError(f"hidden must be a share in [0, 1], not {hidden}.")
+    zeros = int(hidden * size)
+    mask = np.repeat([0.0, 1.0], [zeros, size - zeros])
+    drawn = np.random.RandomState(0).permutation(mask)
+    return jnp.asarray(drawn.astype(np.float32))
+
+
+def check_physics(change: TaskChange, bodies: Sequence[str]) -> None:
+    """Raises `UserError` unless a domain with these bodies can be changed so."""
+    if change.extra:
+        raise UserError(f"Brax tasks take no extra values: {dict(change.extra)}.")
+    check_names("body", change.bodies, bodies)
+    for body, factor in change.bodies.items():
+        if not factor > 0:
+            raise UserError(f"The factor of body {body!r} must be > 0, not {factor}.")
+    if not change.friction >= 0:
+        raise UserError(f"friction must be >= 0, not {change.friction}.")
+
+
+def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
+    """Raises `UserError` for the first of `names` that is not `known`."""
+    for name in names:
+        if name not in known:
+            choices = ", ".join(known) if known else "none"
+            raise UserError(f"Unknown {kind} {name!r}; known: {choices}.")

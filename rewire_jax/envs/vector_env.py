@@ -1,0 +1,156 @@
+"""Simulators side by side on the host, in processes where there are cores for them."""
+
+import functools
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs.base import HostEnvironment, Task
+
+Array = NDArray[Any]
+
+
+class Moment(NamedTuple):
+    """What a step gave in each lane.
+
+    Attributes:
+      observation: `[lanes, observations]` float32.
+      reward: `[lanes]` float32.
+      terminal: `[lanes]` bool, ended by the task.
+      success: `[lanes]` bool; False where none is known.
+    """
+
+    observation: Array
+    reward: Array
+    terminal: Array
+    success: Array
+
+
+class Lanes:
+    """Simulators that are reset and stepped together.
+
+    They are no state of a run, but remember where they are: what seeds and actions
+    lead to can be had again by resetting and stepping.
+
+    Attributes:
+      task: index of the task that is played, -1 before the first reset.
+      seeds: `[lanes]` int64, of the running episodes.
+      steps: `[lanes]` int, of the running episodes.
+      observation: `[lanes, observations]`, the latest.
+    """
+
+    def __init__(self, environment: HostEnvironment, count: int):
+        """Makes the simulators; a process each, unless this one is as fast."""
+        # Only those who have such an environment have gymnasium.
+        from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+        makers = [environment.make] * count
+        mode, cores = AutoresetMode.DISABLED, _cores()
+        if min(count, cores) == 1:
+            self._vector: Any = SyncVectorEnv(makers, autoreset_mode=mode)
+        else:
+            with _deaf_to_interrupts():
+                # JAX has threads, which a forked process would lack.
+                self._vector = AsyncVectorEnv(
+                    makers, context="spawn", autoreset_mode=mode, max_concurrency=cores
+                )
+        self.task = -1
+        self.seeds = np.zeros(count, np.int64)
+        self.steps = np.zeros(count, np.int64)
+        self.observation = np.zeros((count, environment.observation_size), np.float32)
+
+    def reset(
+        self, task: int, seeds: Sequence[int] | Array, where: Array | None = None
+    ) -> Array:
+        """Begins episodes.
+
+        Args:
+          task: its index, the same in all lanes.
+          seeds: `[lanes]` int.
+          where: `[lanes]` bool, the lanes that begin one; all if None.
+
+        Returns:
+          `[lanes, observations]` float32, the latest of each lane.
+        """
+        where = np.ones(len(self.seeds), bool) if where is None else where
+        options = {"task": task, "reset_mask": where}
+        given = [int(seed) for seed in seeds]
+        with _whole():
+            self.observation, _ = self._vector.reset(seed=given, options=options)
+        self.task = task
+        self.seeds = np.where(where, np.asarray(seeds), self.seeds)
+        self.steps = np.where(where, 0, self.steps)
+        return self.observation
+
+    def step(self, actions: Array) -> Moment:
+        """Steps all lanes; `actions` is `[lanes, actions]` float32 in [-1, 1]."""
+        with _whole():
+            observation, reward, terminal, _, info = self._vector.step(actions)
+        self.observation = observation
+        self.steps = self.steps + 1
+        success = info.get("success", np.zeros(len(self.seeds), bool))
+        return Moment(
+            observation, reward.astype(np.float32), terminal, success.astype(bool)
+        )
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Processes that are started here go on at Ctrl-C, until the first one ends them.
+
+    Raises:
+      UserError: they end while they start.
+    """
+    # Started later, it would let interrupts through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    except (EOFError, ConnectionError) as error:
+        raise UserError(
+            "the simulators' processes end while they start: a script must train under "
+            "`if __name__ == '__main__':`, since they import it"
+        ) from error
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _whole() -> Iterator[None]:
+    """What is left in its middle serves nobody any more."""
+    try:
+        yield
+    except BaseException:
+        open_lanes.cache_clear()
+        raise
+
+
+def _cores() -> int:
+    """How many this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        return os.cpu_count() or 1
+
+
+def draw_seed(*words: int) -> int:
+    """A seed that follows from some numbers."""
+    return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+
+def shown(observation: Array, task: Task, shape: tuple[int, ...]) -> Array:
+    """What a policy is shown, `[*shape, observations]`."""
+    return observation.reshape(*shape, -1) * np.asarray(task.observation_mask)
+
+
+@functools.lru_cache(maxsize=1)
+def open_lanes(environment: HostEnvironment, count: int) -> Lanes:
+    """So many lanes; asked for again, the same, since starting them takes seconds."""
+    return Lanes(environment, count)

@@ -1,0 +1,224 @@
+"""Progressive networks: a column for each task, fed by all before (arXiv 1606.04671).
+
+Column k computes, from the hidden activations h of the columns before it, in every
+layer i but the first
+
+    x_i = W_i h_{i-1} + U_i activate(V_i (a_i [h_{i-1} of column 0, ..., k - 1])),
+
+biases in W and U, and column 0 computes W_i h_{i-1} alone. Arrays have room for the
+whole sequence: the activations of columns that do not come before are zeros, so that
+their part of V neither matters nor learns.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.core.settings import require, settings
+from rewire_jax.methods.base import Method, Shared, Spec, at, count, put, tile
+from rewire_jax.nn import networks
+from rewire_jax.nn.networks import Linear
+
+
+@settings
+class PnnSettings:
+    """Progressive networks.
+
+    Attributes:
+      width: neurons in each hidden layer of a column.
+    """
+
+    width: int = 96
+
+    def checked(self) -> "PnnSettings":
+        """The settings as they are; `UserError` if they make no sense."""
+        require(self.width >= 1, f"--width must be at least 1, not {self.width}")
+        return self
+
+
+def preset(scenario: str, period: int, profile: str) -> PnnSettings:
+    """The published width, half of it in the quick profile."""
+    del scenario, period
+    return PnnSettings(width=48 if profile == "quick" else 96)
+
+
+class Lateral(NamedTuple):
+    """A layer's connection to the layer below it in the earlier columns.
+
+    Attributes:
+      scale: `[]`, a.
+      inner: `[width, slots * width]`, V.
+      outer: `width -> outputs`, U.
+    """
+
+    scale: jax.Array
+    inner: jax.Array
+    outer: Linear
+
+
+class Column(NamedTuple):
+    """One task's network.
+
+    Attributes:
+      layers: W of all layers.
+      laterals: those of all layers but the first.
+    """
+
+    layers: tuple[Linear, ...]
+    laterals: tuple[Lateral, ...]
+
+
+class Memory(NamedTuple):
+    """Finished columns.
+
+    Attributes:
+      learned: `[]` number of finished tasks.
+      columns: `[tasks, ...]`; until then all are as they were made.
+    """
+
+    learned: jax.Array
+    columns: Column
+
+
+class Policy(NamedTuple):
+    """One of the finished columns.
+
+    Attributes:
+      columns: `[tasks, ...]`, the same for all tasks.
+      place: `[]`, that of the column whose output is the policy's.
+    """
+
+    columns: Shared
+    place: jax.Array
+
+
+def pnn(spec: Spec, options: PnnSettings) -> Method:
+    """Each task trains a new column; those before it are frozen."""
+    width, tasks = options.width, spec.tasks
+    sizes = spec.sizes(width)
+
+    def init_column(key, place):
+        key, *keys = jax.random.split(key, spec.depth + 1)
+        earlier = jnp.maximum(place, 1)
+
+        def lateral(key, outputs):
+            scale_key, inner_key, outer_key = jax.random.split(key, 3)
+            shape = (width, max(tasks - 1, 1) * width)
+            bound = (earlier * width) ** -0.5
+            return Lateral(
+                scale=jax.random.uniform(scale_key) / earlier,
+                inner=bound * jax.random.uniform(inner_key, shape, minval=-1.0),
+                outer=networks.init_linear(outer_key, width, outputs),
+            )
+
+        return Column(
+            layers=networks.init_mlp(key, sizes),
+            laterals=tuple(map(lateral, keys, sizes[2:])),
+        )
+
+    def init(key):
+        params = init_column(key, jnp.zeros((), jnp.int32))
+        return params, Memory(jnp.zeros((), jnp.int32), tile(params, tasks))
+
+    def start_task(key, params, memory, task):
+        del params
+        return init_column(key, task), memory
+
+    def distribution(params, memory, context, observation):
+        del context
+        return play(memory.columns, params, memory.learned, observation)
+
+    def end_task(params, memory, task, selection):
+        del selection
+        columns = put(memory.columns, task, params)
+        return params, Memory(memory.learned + 1, columns)
+
+    def policy(params, memory, task):
+        del params
+        latest = jnp.maximum(memory.learned - 1, 0)
+        return Policy(Shared(memory.columns), jnp.minimum(task, latest))
+
+    def size(params, memory):
+        columns = jnp.maximum(memory.learned, 1)
+        scales_and_outer = count([(x.scale, x.outer) for x in params.laterals])
+        inner = spec.depth * width * width
+        pairs = columns * (columns - 1) // 2
+        laterals = (columns - 1) * scales_and_outer + pairs * inner
+        return columns * count(params.layers) + laterals
+
+    return Method(
+        init=init,
+        distribution=distribution,
+        policy=policy,
+        act=act,
+        size=size,
+        start_task=start_task,
+        end_task=end_task,
+    )
+
+
+def act(policy: Policy, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Mean and log-std, each `[..., actions]`, of a frozen column."""
+    (columns,), place = policy
+    return play(columns, at(columns, place), place, observation)
+
+
+def play(
+    columns: Column, column: Column, place: jax.Array, observation: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Mean and log-std of a column; gradients flow into it alone.
+
+    Args:
+      columns: `[tasks, ...]`, of which the first `place` come before it.
+      column: the column that is played.
+      place: `[]`, its place in the sequence.
+      observation: `[..., observations]`.
+
+    Returns:
+      Mean and log-std, each `[..., actions]`.
+    """
+    # A loop of unknown length has no gradient, and needs none.
+    columns, observation = jax.lax.stop_gradient((columns, observation))
+    width = column.layers[0].bias.size
+    shape = (*observation.shape[:-1], column.laterals[0].inner.shape[1])
+    nothing = [jnp.zeros(shape, observation.dtype) for _ in column.laterals]
+
+    def join(place, earlier):
+        hidden, _ = run_column(at(columns, place), place, earlier, observation)
+        return [
+            jax.lax.dynamic_update_slice_in_dim(joined, x, place * width, axis=-1)
+            for joined, x in zip(earlier, hidden, strict=True)
+        ]
+
+    earlier = jax.lax.fori_loop(0, place, join, nothing)
+    _, output = run_column(column, place, earlier, observation)
+    return networks.gaussian(output)
+
+
+def run_column(
+    column: Column, place: jax.Array, earlier: list[jax.Array], observation: jax.Array
+) -> tuple[list[jax.Array], jax.Array]:
+    """A column's hidden activations and output.
+
+    Args:
+      column: the column.
+      place: `[]`, its place in the sequence.
+      earlier: for each hidden layer the activations `[..., slots * width]` of the
+        columns before it, side by side, then zeros.
+      observation: `[..., observations]`.
+
+    Returns:
+      Activations `[..., width]` of each hidden layer, and `[..., 2 * actions]`.
+    """
+    first, *layers = column.layers
+    x = networks.affine(first, observation)
+    hidden = []
+    for layer, lateral, below in zip(layers, column.laterals, earlier, strict=True):
+        x = networks.activate(x)
+        hidden.append(x)
+        inner = networks.activate((lateral.scale * below) @ lateral.inner.T)
+        side = networks.affine(lateral.outer, inner)
+        # The authors' first column activates its output, too, which looks like a slip.
+        x = networks.affine(layer, x) + jnp.where(place > 0, side, 0.0)
+    return hidden, x

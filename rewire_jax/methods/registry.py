@@ -1,0 +1,68 @@
+"""The methods by name."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.methods import csp, finetune, packnet, pnn, regularization
+from rewire_jax.methods import rewire as rewiring
+from rewire_jax.methods.base import Method, Spec
+
+
+class Entry(NamedTuple):
+    """How a method is made.
+
+    Attributes:
+      make: `(spec, settings) -> Method`.
+      settings: its settings class, made with `settings`; `checked()` gives
+        settings ready to use or raises `UserError`.
+      preset: `(scenario name, period, profile) -> settings`; tasks recur after
+        `period` places.
+      selection_episodes: that each of its candidates is played by default; None for
+        the profile's number.
+      together: makes the settings of members of one population alike in all that
+        shapes the program.
+    """
+
+    make: Callable[[Spec, Any], Method]
+    settings: type
+    preset: Callable[[str, int, str], Any]
+    selection_episodes: int | None = None
+    together: Callable[[Sequence[Any]], list[Any]] = list
+
+
+# In the order of the paper's Table 1.
+METHODS: dict[str, Entry] = {
+    "ft1": Entry(finetune.ft1, finetune.FinetuneSettings, finetune.preset),
+    "ft_l2": Entry(
+        regularization.ft_l2, regularization.FtL2Settings, regularization.preset_ft_l2
+    ),
+    "packnet": Entry(packnet.packnet, packnet.PackNetSettings, packnet.preset),
+    "ewc": Entry(
+        regularization.ewc, regularization.EwcSettings, regularization.preset_ewc
+    ),
+    "pnn": Entry(pnn.pnn, pnn.PnnSettings, pnn.preset),
+    "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
+    "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
+    "csp": Entry(csp.csp, csp.CspSettings, csp.preset, 1),
+    "rewire": Entry(
+        rewiring.rewire,
+        rewiring.RewireSettings,
+        rewiring.preset,
+        together=rewiring.together,
+    ),
+}
+
+
+def register_method(name: str, entry: Entry) -> None:
+    """Adds a method of one's own, usable by name wherever the others are."""
+    METHODS[name] = entry
+
+
+def find_method(name: str) -> Entry:
+    """The method of that name; `UserError` if there is none."""
+    if name not in METHODS:
+        raise UserError(
+            f"unknown method {name!r}: choose one of {', '.join(sorted(METHODS))}"
+        )
+    return METHODS[name]

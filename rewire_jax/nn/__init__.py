@@ -1,0 +1,1 @@
+"""The permutation operator with its backward pass, and the networks."""

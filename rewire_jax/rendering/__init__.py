@@ -1,0 +1,1 @@
+"""An episode as a web page and as a GIF."""

@@ -1,0 +1,338 @@
+"""From the results of runs to the numbers that a report shows."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.reports import metrics, paper_results
+from rewire_jax.reports.paper_results import Figures, Source
+from rewire_jax.storage.run_results import RunData
+from rewire_jax.storage.scores import Score
+
+Array = NDArray[np.float64]
+Tasks = tuple[dict[str, "Spread"], ...]
+
+# Runs that differ in one of these are not comparable and share no table; with what
+# earlier runs had, where they do not say.
+_SHARED = {
+    "scenario": None,
+    "profile": None,
+    "backend": None,
+    "interactions": None,
+    "reward": "v2",
+}
+# The measures of a task, in a table's order, with their headings.
+MEASURES = {
+    "before": "before training",
+    "after": "right after own training",
+    "end": "at the end",
+    "forgetting": "forgetting",
+}
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A value over seeds.
+
+    Attributes:
+        values: one a seed, NaN where missing.
+        mean: None without values.
+        std: the sample standard deviation, None with fewer than two seeds.
+    """
+
+    values: tuple[float, ...]
+    mean: float | None
+    std: float | None
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its 95% interval, None where there is none."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A run's numbers; its diverged seeds are left out.
+
+    Where a SAC-N run normalises, all but `tasks` are multiples of its performance.
+
+    Attributes:
+        label: the method as the paper calls it, with the folder's name where two runs
+            share a method.
+        run: what was read.
+        tasks: for each task of the sequence, scores of its `MEASURES`, and "transfer"
+            where single-task runs are given; those of tasks not trained yet have no
+            values but `before`.
+        others: the same by the name of every other score that was measured.
+        performance: score after the last finished stage, averaged over the tasks
+            trained by then.
+        iqm: interquartile mean of these scores over seeds and tasks, with its
+            stratified bootstrap interval.
+        forgetting: averaged over those tasks.
+        transfer: forward transfer averaged over those tasks, where SAC-N normalises or
+            single-task runs are given.
+        published: the paper's result from each source, None where it has none or where
+            several runs share the method.
+    """
+
+    label: str
+    run: RunData
+    tasks: Tasks
+    others: dict[str, Tasks]
+    performance: Spread
+    iqm: Interval
+    forgetting: Spread
+    transfer: Spread
+    published: tuple[Figures | None, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Comparable runs.
+
+    Attributes:
+        summaries: one for each run.
+        score: what all of them are measured by.
+        sources: where `Summary.published` is from.
+        raw: why scores are raw returns; None where SAC-N normalises them, and for
+            scores that are not to be normalised.
+        single: what learned one of the tasks alone, that forward transfer is measured
+            from.
+    """
+
+    summaries: tuple[Summary, ...]
+    score: Score
+    sources: tuple[Source, ...]
+    raw: str | None
+    single: tuple[RunData, ...]
+
+    @property
+    def normalised(self) -> bool:
+        """Whether scores are multiples of SAC-N's."""
+        return self.score.normalised and self.raw is None
+
+    @property
+    def unit(self) -> str:
+        """What scores are measured in."""
+        return "÷ SAC-N" if self.normalised else self.score.unit
+
+    @property
+    def transferred(self) -> bool:
+        """Whether there is something that forward transfer can be measured from."""
+        return self.score.normalised or bool(self.single)
+
+    @property
+    def measures(self) -> dict[str, str]:
+        """The measures of a task, with their headings."""
+        return MEASURES | ({"transfer": "forward transfer"} if self.single else {})
+
+
+def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Comparison:
+    """Summarizes comparable runs.
+
+    Args:
+        runs: one or more, complete or partial.
+        single: finished runs of one task each, from which forward transfer is measured.
+
+    Raises:
+        UserError: there is no run, one is given twice, they are not comparable, or a
+            task lacks its single-task run.
+    """
+    if not runs:
+        raise UserError("no run to report on: name the folder of one or more")
+    first = runs[0]
+    for run in runs[1:]:
+        _check(run, first, *_SHARED)
+        if run.tasks != first.tasks:
+            raise UserError(
+                f"cannot compare {run.folder} with {first.folder}: other tasks"
+            )
+    areas = _alone(single, first)
+    base, raw = _reference(runs) if first.score.normalised else (None, None)
+    sources = paper_results.sources(first.settings["scenario"])
+    methods = Counter(run.settings["method"] for run in runs)
+    summaries = []
+    for run, label in zip(runs, _labels(runs), strict=True):
+        method = run.settings["method"]
+        # The paper has one result a method: it belongs to none of several variants.
+        alone = methods[method] == 1
+        theirs = tuple(s.results.get(method) if alone else None for s in sources)
+        summaries.append(_summary(run, label, base, areas, theirs))
+    return Comparison(tuple(summaries), first.score, sources, raw, tuple(single))
+
+
+def spread(values: Array) -> Spread:
+    """Mean and sample standard deviation over seeds.
+
+    Args:
+        values: `[seeds]`; NaN is passed over.
+    """
+    there = values[~np.isnan(values)]
+    return Spread(
+        values=tuple(values.tolist()),
+        mean=float(there.mean()) if there.size else None,
+        std=float(there.std(ddof=1)) if there.size > 1 else None,
+    )
+
+
+def _check(run: RunData, other: RunData, *names: str) -> None:
+    """Runs are comparable in these settings, and in what they are measured by."""
+    facts = [
+        {name: each.settings.get(name, _SHARED[name]) for name in names}
+        | {"measured by": each.score.noun}
+        for each in (run, other)
+    ]
+    for name, mine in facts[0].items():
+        if mine != facts[1][name]:
+            raise UserError(
+                f"cannot compare {run.folder} ({name} {mine}) with "
+                f"{other.folder} ({name} {facts[1][name]})"
+            )
+
+
+def _alone(single: Sequence[RunData], first: RunData) -> dict[str, float]:
+    """By the name of a task, its `metrics.area` where it is learned alone."""
+    if not single:
+        return {}
+    if first.score.normalised:
+        raise UserError(
+            f"single-task runs serve success rates, and {first.folder} has none"
+        )
+    alone: dict[str, float] = {}
+    for run in single:
+        _check(run, first, *(name for name in _SHARED if name != "scenario"))
+        if len(run.tasks) > 1 or not run.complete or not run.kept.any():
+            raise UserError(f"{run.folder} is not a finished run of a single task")
+        if run.tasks[0] in alone:
+            raise UserError(f"there are two single-task runs of {run.tasks[0]}")
+        alone[run.tasks[0]] = float(_areas(run, 1).mean())
+    missing = [name for name in dict.fromkeys(first.tasks) if name not in alone]
+    if missing:
+        raise UserError(f"there is no single-task run of {', '.join(missing)}")
+    return alone
+
+
+def _areas(run: RunData, done: int) -> Array:
+    """`[kept seeds, done]`: mean score over the training of each of the first tasks."""
+    areas = [metrics.area(x, values[run.kept]) for x, values in run.curve[:done]]
+    return np.reshape(areas, (done, run.kept.sum())).T
+
+
+def _reference(runs: Sequence[RunData]) -> tuple[RunData | None, str | None]:
+    """The SAC-N run that normalises all runs, or None and why there is none."""
+    found = [run for run in runs if run.settings["method"] == "sac_n"]
+    if len(found) != 1:
+        some = "more than one SAC-N run" if found else "no SAC-N run"
+        return None, f"there is {some} among them to normalise with"
+    (base,) = found
+    stages = {run.finished for run in runs} - {0}
+    if not base.kept.any():
+        return None, "all seeds of SAC-N diverged"
+    if stages and max(stages) > base.finished:
+        return None, "SAC-N has finished fewer tasks than another run"
+    averages = [metrics.final(_matrix(base, stage)).mean() for stage in stages]
+    if not all(average > 0 for average in averages):
+        return None, "SAC-N's average return is not above 0"
+    return base, None
+
+
+def _matrix(run: RunData, done: int, score: Score | None = None) -> Array:
+    """`[kept seeds, done, done]`: the first tasks are a sequence of their own."""
+    return run.measured[score or run.score][run.kept, 1 : done + 1, :done]
+
+
+def _summary(
+    run: RunData,
+    label: str,
+    base: RunData | None,
+    areas: dict[str, float],
+    theirs: tuple[Figures | None, ...],
+) -> Summary:
+    performance = forgetting = transfer = np.zeros(0)
+    ends = np.zeros((0, 0))
+    own: dict[str, Array] = {}
+    if areas:
+        alone = [areas[name] for name in run.tasks[: run.finished]]
+        own["transfer"] = metrics.area_transfer(_areas(run, run.finished), alone)
+    if run.finished:
+        matrix = _matrix(run, run.finished)
+        if base:
+            # SAC-N as it was after as many tasks, the mean over its seeds.
+            other = _matrix(base, run.finished).mean(axis=0)
+            scale = metrics.final(other)
+            matrix = metrics.normalise(matrix, scale)
+            fresh = metrics.normalise(metrics.after_own_training(other), scale)
+            transfer = metrics.forward_transfer(matrix, fresh).mean(axis=-1)
+        if areas:
+            transfer = own["transfer"].mean(axis=-1)
+        performance = metrics.performance(matrix)
+        forgetting = metrics.forgetting(matrix).mean(axis=-1)
+        ends = metrics.final(matrix)
+    others = [each for each in run.measured if each != run.score]
+    return Summary(
+        label=label,
+        run=run,
+        tasks=_tasks(run, run.score, own),
+        others={score.name: _tasks(run, score, {}) for score in others},
+        performance=spread(performance),
+        iqm=_iqm(ends),
+        forgetting=spread(forgetting),
+        transfer=spread(transfer),
+        published=theirs,
+    )
+
+
+def _tasks(run: RunData, score: Score, own: dict[str, Array]) -> Tasks:
+    """Scores of each task, see `Summary.tasks`, and other measures of its own."""
+    columns = own | {"before": run.measured[score][run.kept, 0]}
+    if run.finished:
+        matrix = _matrix(run, run.finished, score)
+        columns["after"] = metrics.after_own_training(matrix)
+        columns["end"] = metrics.final(matrix)
+        columns["forgetting"] = metrics.forgetting(matrix)
+    empty = np.zeros(0)
+    return tuple(
+        {
+            name: spread(values[:, task])
+            if (values := columns.get(name)) is not None and task < values.shape[1]
+            else spread(empty)
+            for name in (*MEASURES, *own)
+        }
+        for task in range(len(run.tasks))
+    )
+
+
+def _iqm(scores: Array) -> Interval:
+    """Interquartile mean of `[seeds, tasks]`; a seed with NaN is passed over."""
+    there = scores[~np.isnan(scores).any(axis=1)]
+    if not there.size:
+        return Interval(None, None, None)
+    value = float(metrics.interquartile_mean(there.ravel()))
+    return Interval(value, *(metrics.stratified_bootstrap(there) or (None, None)))
+
+
+def _labels(runs: Sequence[RunData]) -> list[str]:
+    """The shortest of method, folder name, path that tells the runs apart."""
+    folders = Counter(run.folder.resolve() for run in runs)
+    folder, times = folders.most_common(1)[0]
+    if times > 1:
+        raise UserError(f"{folder} is given twice")
+    methods = [str(run.settings["method"]) for run in runs]
+    methods = [paper_results.NAMES.get(method, method) for method in methods]
+    names = [f"{m}: {r.folder.name}" for m, r in zip(methods, runs, strict=True)]
+    paths = [f"{m}: {r.folder}" for m, r in zip(methods, runs, strict=True)]
+    labels = []
+    for method, name, path in zip(methods, names, paths, strict=True):
+        if methods.count(method) == 1:
+            labels.append(method)
+        else:
+            labels.append(name if names.count(name) == 1 else path)
+    return labels

@@ -1,0 +1,1 @@
+"""The host's side: train, resume, sweep, evaluate, load policies, log."""

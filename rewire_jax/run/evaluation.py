@@ -1,0 +1,133 @@
+"""Looking at scenarios and at finished runs."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax.core.settings import require
+from rewire_jax.envs.scenarios import Scenario
+from rewire_jax.methods import METHODS, find_method
+from rewire_jax.methods.base import Selection, Spec
+from rewire_jax.run import run_state
+from rewire_jax.run.run_state import saved
+from rewire_jax.storage import run_folder
+from rewire_jax.training import rollout
+from rewire_jax.training.presets import preset
+from rewire_jax.training.run_setup import base_size, make_spec, prepare
+
+
+def info(scenario: Scenario) -> dict[str, Any]:
+    """What there is to know about a scenario before running it, JSON-ready.
+
+    The model size is the largest that a method can reach in it with the paper
+    profile, divided by that of a plain policy.
+    """
+    sizes = {}
+    for method in METHODS:
+        settings = preset(scenario, method)
+        spec = make_spec(settings, scenario.environment)
+        numbers = most_stored(method, spec, settings.options.checked())
+        sizes[method] = max(numbers) / base_size(spec)
+    return {
+        "scenario": scenario.name,
+        "domain": scenario.domain,
+        "backend": scenario.backend,
+        "interactions": scenario.interactions,
+        "observation_size": scenario.environment.observation_size,
+        "action_size": scenario.environment.action_size,
+        "tasks": [
+            {
+                "name": task.name,
+                "action_scale": task.action_scale.tolist(),
+                "observation_mask": task.observation_mask.tolist(),
+            }
+            for task in scenario.tasks
+        ],
+        "model_size": sizes,
+    }
+
+
+def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
+    """The most numbers that a method stores in a run over the whole sequence.
+
+    Returns:
+      That of a run in which the first of the method's candidates is always the best,
+      and that of one in which it is the last: what is stored may depend on it.
+    """
+    method = find_method(name).make(spec, options)
+
+    def run(best_first: jax.Array) -> jax.Array:
+        key = jax.random.key(0)
+
+        def one(carry: Any, task: jax.Array) -> tuple[Any, jax.Array]:
+            params, memory = method.start_task(key, *carry, task)
+            selection = None
+            if method.candidates is not None:
+                valid = method.candidates(params, memory, task).valid
+                after = 1.0 + jnp.arange(valid.size)
+                after = jnp.where(best_first, after[::-1], after)
+                selection = Selection(jnp.zeros_like(after), after)
+            carry = method.end_task(params, memory, task, selection)
+            return carry, method.size(*carry)
+
+        _, sizes = jax.lax.scan(one, method.init(key), jnp.arange(spec.tasks))
+        return jnp.max(sizes)
+
+    # What the count does not need is left out of the compiled function.
+    numbers = jax.jit(jax.vmap(run))(jnp.array([True, False]))
+    return [int(number) for number in numbers]
+
+
+def evaluate(
+    run: str | Path, *, stage: int | None = None, episodes: int = 128, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Plays all tasks of a run without exploration.
+
+    Args:
+      run: folder of the run.
+      stage: as it was after this task's training; the latest if None.
+      episodes: for each task and member.
+      seed: of the episodes.
+
+    Returns:
+      A row for each member and task: task, name, seed (the member's), return, std
+      (over episodes), steps (in all episodes), and, where it is known, success and
+      success_last: shares of the episodes solved at any step, and at the last.
+
+    Raises:
+      UserError: no such run or stage, or a damaged checkpoint.
+    """
+    require(episodes >= 1, f"--episodes must be at least 1, not {episodes}")
+    folder = Path(run)
+    require(
+        run_folder.kind(folder) == "run",
+        f"{folder} holds a sweep: `rewire-jax report {folder}` shows its evaluations, "
+        "load_policy gives the policy of a member",
+    )
+    _, settings = saved(folder)
+    plan = prepare(settings)
+    learner = jax.eval_shape(plan.program.init, plan.members)
+    like = learner.params, learner.memory
+    params, memory = run_state.read_policies(folder, stage, like)
+    learner = plan.program.init(plan.members)._replace(params=params, memory=memory)
+    policies = plan.program.policies(plan.members, learner)
+    keys = jax.random.split(jax.random.key(seed), (plan.places, len(plan.names)))
+    result = plan.program.rollout(plan.tasks, policies, keys, episodes)
+    returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
+    solved = {n: np.asarray(x) for n, x in rollout.named(result.success).items()}
+    return [
+        {
+            "task": task,
+            "name": name,
+            "seed": member.seed,
+            "return": float(returns[place, task].mean()),
+            "std": float(returns[place, task].std()),
+            "steps": int(lengths[place, task].sum()),
+        }
+        | {name: float(x[place, task].mean()) for name, x in solved.items()}
+        for place, member in enumerate(plan.crowd)
+        for task, name in enumerate(plan.names)
+    ]

@@ -1,0 +1,274 @@
+"""Where a run stands, and its checkpoints.
+
+`checkpoints/task-003` is what is kept for ever once three tasks are finished: policies
+and critics, since all else starts anew with a task. `checkpoints/task-003-step-0000200`
+is everything in the middle of the next one; only the last of these is kept.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import Settings, from_json
+from rewire_jax.methods import find_method
+from rewire_jax.storage import checkpoint, run_folder
+from rewire_jax.storage.json_lines import reading
+from rewire_jax.training import population
+from rewire_jax.training.run_setup import Plan
+from rewire_jax.training.sac import Learner
+from rewire_jax.training.train_loop import State
+
+_FOLDER = "checkpoints"
+
+
+class Standing(NamedTuple):
+    """Where a run stands; between tasks `state` is None and `steps` 0.
+
+    Attributes:
+      stage: the task being trained, or to be trained next.
+      steps: steps of all environments made in it.
+      learner: between tasks, what was learned.
+      state: within a task, all of it.
+      before: within a task, the candidates' returns at its start, or None.
+      alive: `[members]` bool on the host, False for frozen members.
+      selection: `[members]` int, interactions spent on candidates so far.
+    """
+
+    stage: int
+    steps: int
+    learner: Learner | None
+    state: State | None
+    before: jax.Array | None
+    alive: np.ndarray
+    selection: jax.Array
+
+
+def start(plan: Plan) -> Standing:
+    """Before the first task."""
+    return Standing(
+        stage=0,
+        steps=0,
+        learner=plan.program.init(plan.members),
+        state=None,
+        before=None,
+        alive=np.ones(plan.places, bool),
+        selection=jnp.zeros(plan.places, jnp.int32),
+    )
+
+
+def interactions(standing: Standing, plan: Plan) -> int:
+    """Of each member, in all tasks together."""
+    steps = min(standing.steps, plan.steps)
+    return standing.stage * plan.interactions + steps * plan.settings.envs
+
+
+def save(folder: Path, standing: Standing) -> None:
+    """Writes a checkpoint, and drops those from within a task that it outdates."""
+    items: dict[str, Any] = {
+        "counts": {"alive": standing.alive, "selection": standing.selection}
+    }
+    name = _name(standing.stage, standing.steps)
+    if standing.learner is not None:
+        items |= _kept(standing.learner)
+    else:
+        items |= {"state": standing.state}
+        if standing.before is not None:
+            items["before"] = standing.before
+    metadata = {
+        "stage": standing.stage,
+        "steps": standing.steps,
+        "items": sorted(items),
+        "tables": run_folder.marks(folder),
+    }
+    checkpoint.save(folder / _FOLDER / name, items, metadata)
+    checkpoints = checkpoint.available(folder / _FOLDER)
+    checkpoint.remove(p for p in checkpoints if "-step-" in p.name and p.name != name)
+
+
+def kept(folder: Path, stage: int | None) -> Path:
+    """The checkpoint kept after a stage, or after the latest one.
+
+    Raises:
+      UserError: there is none.
+    """
+    checkpoints = checkpoint.available(folder / _FOLDER)
+    between = [path for path in checkpoints if "-step-" not in path.name]
+    if stage is not None:
+        between = [path for path in between if path.name == _name(stage + 1)]
+    if not between:
+        which = (
+            "finished no task" if stage is None else f"no checkpoint of task {stage}"
+        )
+        raise UserError(f"{folder} has {which} yet")
+    return between[0]
+
+
+def finished(folder: Path, stage: int) -> bool:
+    """Whether what is kept after a stage is there."""
+    return (folder / _FOLDER / _name(stage + 1)).exists()
+
+
+def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | None:
+    """The newest standing whose checkpoint and rows are whole, None if there is none.
+
+    What the run's tables hold beyond it is cut off.
+
+    Args:
+      folder: of the run.
+      plan: of the run.
+      say: is told about every checkpoint that cannot be used.
+    """
+    for path in checkpoint.available(folder / _FOLDER):
+        try:
+            standing, marks = _load(path, plan)
+        except checkpoint.CheckpointError as error:
+            say(f"{error}; falling back to the one before")
+            continue
+        changed = run_folder.changed(folder, marks)
+        if not changed:
+            run_folder.cut(folder, marks)
+            return standing
+        say(
+            f"{changed} has lost or foreign rows; falling back to the checkpoint "
+            f"before {path.name}"
+        )
+    run_folder.cut(folder, {})
+    return None
+
+
+def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, run_folder.Mark]]:
+    program, members = plan.program, plan.members
+    learner = jax.eval_shape(program.init, members)
+    like: dict[str, Any] = {"counts": _counts(plan)}
+    metadata = _facts(path)
+    saved = metadata["items"]
+    if "state" in saved:
+        task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+        like["state"] = program.expect(
+            members, learner, like["counts"]["alive"], 0, task
+        )
+    else:
+        like |= _kept(learner)
+    if "before" in saved and program.candidates is not None:
+        candidates = jax.eval_shape(program.candidates, members, learner, 0)
+        like["before"] = jax.ShapeDtypeStruct(candidates.valid.shape, jnp.float32)
+    items, _ = checkpoint.load(path, like)
+    if "policy" in items:
+        return between(metadata["stage"], items, plan), metadata["tables"]
+    items = population.place(items, plan.mesh)
+    return Standing(
+        stage=metadata["stage"],
+        steps=metadata["steps"],
+        learner=None,
+        state=items["state"],
+        before=items.get("before"),
+        alive=np.asarray(items["counts"]["alive"]),
+        selection=items["counts"]["selection"],
+    ), metadata["tables"]
+
+
+def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
+    """What is kept after a stage: items `[members]` for `between`, on the host.
+
+    Raises:
+      CheckpointError: it is missing or damaged.
+    """
+    learner = jax.eval_shape(plan.program.init, plan.members)
+    like = {"counts": _counts(plan)} | _kept(learner)
+    path = folder / _FOLDER / _name(stage + 1)
+    _facts(path)
+    return checkpoint.load(path, like)[0]
+
+
+def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
+    """The policies kept after a stage, or after the latest one.
+
+    Args:
+      folder: of the run.
+      stage: of its sequence, or None.
+      like: params and memory, `[members]`, as shapes.
+
+    Returns:
+      The same, on the host.
+
+    Raises:
+      UserError: there are none, or they are damaged.
+    """
+    path = kept(folder, stage)
+    try:
+        _facts(path)
+        return checkpoint.load(path, {"policy": like})[0]["policy"]
+    except checkpoint.CheckpointError as error:
+        raise checkpoint.CheckpointError(
+            f"{error}; delete it and what is newer beside it, and --resume trains "
+            "that again"
+        ) from error
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    """What a checkpoint says of itself.
+
+    Raises:
+      CheckpointError: it is not that of a run, or it is another than its name says.
+    """
+    facts = checkpoint.read_metadata(path)
+    try:
+        with reading(path):
+            name = _name(facts["stage"], facts["steps"])
+            list(facts["items"]), dict(facts["tables"])
+    except UserError as error:
+        raise checkpoint.CheckpointError(str(error)) from error
+    if path.name != name:
+        raise checkpoint.CheckpointError(f"checkpoint {path} was written as {name}")
+    return facts
+
+
+def between(stage: int, items: dict[str, Any], plan: Plan) -> Standing:
+    """The standing before a task, from what is kept after the one before."""
+    items = population.place(items, plan.mesh)
+    params, memory = items["policy"]
+    return Standing(
+        stage=stage,
+        steps=0,
+        # The rest of a learner starts anew with the next task.
+        learner=plan.program.init(plan.members)._replace(
+            params=params, memory=memory, critic=items["critic"]
+        ),
+        state=None,
+        before=None,
+        alive=np.asarray(items["counts"]["alive"]),
+        selection=items["counts"]["selection"],
+    )
+
+
+def _counts(plan: Plan) -> dict[str, Any]:
+    return {
+        "alive": jax.ShapeDtypeStruct((plan.places,), bool),
+        "selection": jax.ShapeDtypeStruct((plan.places,), jnp.int32),
+    }
+
+
+def _kept(learner: Learner) -> dict[str, Any]:
+    return {"policy": (learner.params, learner.memory), "critic": learner.critic}
+
+
+def _name(tasks: int, steps: int = 0) -> str:
+    return f"task-{tasks:03d}" + (f"-step-{steps:07d}" if steps else "")
+
+
+def saved(folder: Path, kind: str = "run") -> tuple[dict[str, Any], Settings]:
+    """The header of a run or sweep, and the settings in it.
+
+    Raises:
+      UserError: there is none; or it is not as this version writes it, which says
+        what version did.
+    """
+    header = run_folder.read_header(folder, kind)
+    entry = find_method(header["settings"]["method"])
+    with run_folder.telling_version(folder, header):
+        return header, from_json(header["settings"], entry.settings)

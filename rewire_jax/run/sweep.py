@@ -1,0 +1,383 @@
+"""A sweep: configurations times seeds as one population, task after task.
+
+settings.json        what all members share, the axes, the members, provenance
+task-000/            the first task
+  batches.json       which members are trained on it side by side
+  batch-000/         their tables and checkpoints, as a run's (see `run_folder`)
+
+Each task is trained by all members, in batches that fit the memory, before the next
+one begins; so the worst can be left out of the next (successive halving, Jamieson and
+Talwalkar 2016).
+"""
+
+import functools
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.formatting import short
+from rewire_jax.core.settings import Settings, require, to_json, validate
+from rewire_jax.envs.scenarios import Scenario, make_scenario
+from rewire_jax.methods import find_method
+from rewire_jax.run import loggers, run_state
+from rewire_jax.run.loggers import Loggers
+from rewire_jax.run.progress import Progress
+from rewire_jax.run.ranking import rank
+from rewire_jax.run.run_state import Standing
+from rewire_jax.run.sweep_grid import configure, draws, grid, read
+from rewire_jax.run.train_run import Run, Stopped, interruptible
+from rewire_jax.storage import checkpoint, run_folder
+from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
+from rewire_jax.training import memory_estimate, population
+from rewire_jax.training.population import Member
+from rewire_jax.training.run_setup import Plan, prepare
+
+_POLL = 1.0  # seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """A sweep, prepared.
+
+    Attributes:
+      folder: of the sweep.
+      settings: what all members share; at the axes, the first configuration's.
+      scenario: of all members.
+      crowd: all members, the seeds of a configuration side by side.
+      axes: names of the settings in which they differ.
+      halving: of the configurations, one in this many goes on to the next task.
+      most: members trained side by side at most.
+      log: where scalars go, too, as `train` has it.
+      progress: makes the display.
+    """
+
+    folder: Path
+    settings: Settings
+    scenario: Scenario
+    crowd: tuple[Member, ...]
+    axes: tuple[str, ...]
+    halving: int
+    most: int
+    log: tuple[str, ...]
+    progress: Callable[..., Progress]
+
+    def run(self) -> None:
+        """Trains what is not finished; each process its own batches.
+
+        Raises:
+          Stopped: interrupted; what is finished is saved.
+        """
+        try:
+            for stage in range(self.settings.tasks):
+                batches, places = self.batches(stage)
+                own = range(jax.process_index(), len(batches), jax.process_count())
+                for number in own:
+                    self.train(stage, number, batches, places)
+                # Also at the end: who coordinates must outlive the others.
+                _wait(functools.partial(self.finished, stage, len(batches)))
+        except (Stopped, KeyboardInterrupt):
+            raise Stopped(
+                "stopped; what was trained is saved: give the same command with "
+                f"--resume, for {self.folder}"
+            ) from None
+
+    def batches(self, stage: int) -> tuple[list[list[int]], int]:
+        """Numbers of the members trained on a task, batch by batch, and the places."""
+        path = batches_of(self.folder, stage)
+        if jax.process_index() == 0 and not path.exists():
+            numbers = self.survivors(stage)
+            size, count = self.share(len(numbers))
+            batches = [numbers[i * size : (i + 1) * size] for i in range(count)]
+            run_folder.make(path.parent)
+            run_folder.write(path, {"size": size, "batches": batches})
+        _wait(path.exists)
+        return read_batches(path)
+
+    def survivors(self, stage: int) -> list[int]:
+        """The members that are to be trained on a task."""
+        if stage == 0:
+            return [member.number for member in self.crowd]
+        before = [n for batch in self.batches(stage - 1)[0] for n in batch]
+        if self.halving == 1:
+            return before
+        data = read_sweep(self.folder)
+        scores = data.choice[before, stage - 1, :stage].mean(axis=1)
+        scores = np.where(data.diverged[before, stage - 1], np.nan, scores)
+        seeds = self.settings.seeds
+        order = rank(scores.reshape(-1, seeds))
+        kept = order[: math.ceil(len(order) / self.halving)]
+        return [n for i in sorted(kept) for n in before[i * seeds : (i + 1) * seeds]]
+
+    def share(self, members: int) -> tuple[int, int]:
+        """Places in a batch and how many batches, for so many members."""
+        devices = jax.local_device_count()
+        # In whole rounds of the devices, as places are.
+        most = max(self.most - self.most % devices, min(self.most, devices))
+        count = math.ceil(members / most)
+        if members >= jax.process_count():
+            count = jax.process_count() * math.ceil(count / jax.process_count())
+        size = math.ceil(members / count)
+        if size > devices:
+            size = devices * math.ceil(size / devices)
+        return size, math.ceil(members / size)
+
+    def finished(self, stage: int, batches: int) -> bool:
+        """Whether all of a task's batches are."""
+        folders = (batch(self.folder, stage, number) for number in range(batches))
+        return all(run_state.finished(folder, stage) for folder in folders)
+
+    def plan(self, numbers: Sequence[int], places: int) -> Plan:
+        """The plan of a batch."""
+        crowd = [self.crowd[number] for number in numbers]
+        return prepare(self.settings, self.scenario, crowd, places)
+
+    def train(
+        self, stage: int, number: int, batches: list[list[int]], places: int
+    ) -> None:
+        """Trains a batch on a task, or what is left of that."""
+        folder = batch(self.folder, stage, number)
+        if run_state.finished(folder, stage):
+            return
+        plan = self.plan(batches[number], places)
+        run_folder.make(folder)
+        label = f"{self.settings.method} sweep on {self.settings.scenario}"
+        if len(batches) > 1:
+            label += f", batch {number + 1} of {len(batches)}"
+        names = [member.name for member in plan.crowd]
+        with ExitStack() as stack:
+            display = stack.enter_context(
+                self.progress(plan.names, plan.interactions, names, label)
+            )
+            subjects = [self.subject(member) for member in plan.crowd]
+            logs = stack.enter_context(Loggers(self.log, subjects, display.message))
+            run = Run(plan, folder, display, logs, choosing=True)
+
+            def start() -> Standing:
+                now = run_state.restore(folder, plan, display.message)
+                if now is None and stage:
+                    now = self.gather(stage, plan)
+                return run.start(now)
+
+            with interruptible(run):
+                # Where it stands is not kept here: what was learned before would be.
+                run.task(start(), self.ahead(stage, number, len(batches)))
+            if run.stopping:  # since the last chunk
+                raise Stopped
+
+    def subject(self, member: Member) -> loggers.Subject:
+        """Whose log a member's is, from one task to the next."""
+        values = {name: read(member, name) for name in self.axes}
+        facts = [f"{name}={short(value)}" for name, value in values.items()]
+        facts = [f"member-{member.number:03d}", *facts, f"seed={member.seed}"]
+        return loggers.subject(self.folder, self.settings, member, ",".join(facts))
+
+    def ahead(self, stage: int, number: int, batches: int) -> int:
+        """Batches that this process is still to train after one."""
+        processes = jax.process_count()
+        left = (batches - number - 1) // processes
+        for later in range(1, self.settings.tasks - stage):
+            left += math.ceil(batches / self.halving**later / processes)
+        return left
+
+    def gather(self, stage: int, plan: Plan) -> Standing:
+        """A batch's members as they were after the task before, wherever that was."""
+        found: dict[int, Any] = {}
+        wanted = {member.number for member in plan.crowd}
+        batches, places = self.batches(stage - 1)
+        for number, numbers in enumerate(batches):
+            if wanted.isdisjoint(numbers):
+                continue
+            folder = batch(self.folder, stage - 1, number)
+            try:
+                made = self.plan(numbers, places)
+                items = run_state.read_kept(folder, stage - 1, made)
+            except checkpoint.CheckpointError as error:
+                raise UserError(
+                    f"{error}; delete {folder} and resume to train it anew"
+                ) from error
+            for place, name in enumerate(numbers):
+                found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
+        rows = [found[member.number] for member in plan.crowd]
+        rows += rows[:1] * (plan.places - len(rows))
+        items = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
+        return run_state.between(stage, items, plan)
+
+
+def sweep(
+    settings: Settings,
+    out: str | Path,
+    *,
+    axes: Mapping[str, Sequence[float]] | None = None,
+    configurations: Sequence[Mapping[str, float]] = (),
+    random: int = 0,
+    halving: int = 1,
+    members_per_batch: int = 0,
+    scenario: Scenario | None = None,
+    resume: bool = False,
+    log: Sequence[str] = (),
+    progress: Callable[..., Progress] = Progress,
+) -> Path:
+    """Trains every configuration with every seed as one population.
+
+    Where several processes have joined by `jax.distributed`, all of them must call
+    this alike, on one file system: each trains batches of its own.
+
+    Args:
+      settings: what the members share; `seeds` is of each configuration.
+      out: folder of the sweep, new or empty, or with `resume` an unfinished one.
+      axes: names of traced settings and their values, of which every combination is
+        a configuration; `modes` is K.
+      configurations: these instead, each with values for the same settings.
+      random: so many random configurations instead; the axes' values are ranges.
+      halving: after each task the best 1 / `halving` of the configurations go on, by
+        episodes apart from those that are reported; 1 for all.
+      members_per_batch: trained side by side at most; 0 for as many as fit.
+      scenario: one of your own; otherwise made from the settings.
+      resume: go on with what is not finished.
+      log: where scalars go, too, as `train` has it.
+      progress: makes the display.
+
+    Returns:
+      The folder; see this module for what it holds, and `write_sweep_report`.
+
+    Raises:
+      UserError: settings that make no sense, a folder that does not fit, a full disk.
+      Stopped: interrupted, and saved.
+    """
+    folder = Path(out)
+    require(halving >= 1, f"--halving must be at least 1, not {halving}")
+    require(members_per_batch >= 0, "--members-per-batch must be at least 0")
+    require(random >= 0, f"--random must be at least 0, not {random}")
+    validate(settings)
+    loggers.check(log)
+    given = {name: [float(x) for x in values] for name, values in (axes or {}).items()}
+    if not configurations:
+        require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
+        configurations = draws(given, random, settings) if random else grid(given)
+    settings, crowd = _crowd(settings, configurations)
+    scenario = scenario or make_scenario(
+        settings.scenario, settings.backend, settings.reward
+    )
+    plan = prepare(settings, scenario, crowd[:1])
+    members = [
+        {
+            "member": member.number,
+            "configuration": member.number // settings.seeds,
+            "seed": member.seed,
+            "values": {name: read(member, name) for name in configurations[0]},
+        }
+        for member in crowd
+    ]
+    header = {
+        "kind": "sweep",
+        "settings": to_json(plan.settings),
+        "axes": given or _values(members),
+        "random": random,
+        "halving": halving,
+        "members": members,
+        "tasks": plan.names,
+        "spec": plan.spec._asdict(),
+        "episode_length": scenario.environment.episode_length,
+        "provenance": run_folder.provenance(),
+    }
+    own = run_folder.held(folder, None if resume else header, "sweep")
+    with ExitStack() as stack:
+        population.at_first(lambda: stack.enter_context(own))
+        _wait((folder / run_folder.HEADER).exists)
+        run_folder.compare(folder, plan.settings, "sweep")
+        saved = run_folder.read_header(folder, "sweep")
+        require(
+            saved["members"] == members and saved["halving"] == halving,
+            f"{folder} was started with other axes, seeds or halving: give the same "
+            "again or name another --out",
+        )
+        need = memory_estimate.need(plan)
+        made = Sweep(
+            folder=folder,
+            settings=plan.settings,
+            scenario=scenario,
+            crowd=crowd,
+            axes=tuple(configurations[0]),
+            halving=halving,
+            most=members_per_batch
+            or memory_estimate.fitting(need, jax.local_devices()),
+            log=tuple(log),
+            progress=progress,
+        )
+        size, _ = made.share(len(crowd))
+        print(f"{need}; {len(crowd)} members, {size} at a time", file=sys.stderr)
+        made.run()
+    return folder
+
+
+def _crowd(
+    settings: Settings, configurations: Sequence[Mapping[str, float]]
+) -> tuple[Settings, tuple[Member, ...]]:
+    """The settings that a population shares, and its members."""
+    same = {frozenset(values) for values in configurations}
+    require(len(same) == 1, "all configurations need values for the same settings")
+    variants = [configure(settings, values) for values in configurations]
+    twice = len(variants) - len({(v.sac, v.options) for v in variants})
+    require(not twice, f"{twice} of the configurations are the same as others")
+    together = find_method(settings.method).together([v.options for v in variants])
+    pairs = [(v.sac, options) for v, options in zip(variants, together, strict=True)]
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    crowd = tuple(
+        member._replace(name=f"member {member.number}")
+        for member in population.cross(pairs, seeds)
+    )
+    return replace(variants[0], options=together[0]), crowd
+
+
+class Found(NamedTuple):
+    """Where a member's policies are: folder, stage, and its place among so many."""
+
+    folder: Path
+    stage: int | None
+    place: int
+    places: int
+
+
+def find(folder: Path, member: int, stage: int | None) -> Found:
+    """Where a member is after a stage, or after the latest one.
+
+    Raises:
+      UserError: it has not been trained so far.
+    """
+    begun = folder.glob("task-[0-9][0-9][0-9]/batches.json")
+    stages = sorted(int(path.parent.name[-3:]) for path in begun)
+    for each in reversed(stages) if stage is None else {stage}.intersection(stages):
+        batches, places = read_batches(batches_of(folder, each))
+        for number, members in enumerate(batches):
+            inside = batch(folder, each, number)
+            if member in members and run_state.finished(inside, each):
+                return Found(inside, each, members.index(member), places)
+    when = "any task" if stage is None else f"task {stage}"
+    raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
+
+
+def _values(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """The values that each setting has among the members, in their order."""
+    values: dict[str, list[float]] = {}
+    for member in members:
+        for name, value in member["values"].items():
+            values.setdefault(name, [])
+            if value not in values[name]:
+                values[name].append(value)
+    return values
+
+
+def _wait(done: Callable[[], bool]) -> None:
+    """Waits for what another process does; its end, too, would end this one."""
+    while not done():
+        time.sleep(_POLL)

@@ -1,0 +1,114 @@
+"""The configurations of a sweep: grids and random draws of numeric settings."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rewire_jax.core.settings import (
+    SacSettings,
+    Settings,
+    flag,
+    require,
+    traced_fields,
+    validate,
+)
+from rewire_jax.training.population import Member
+
+Values = dict[str, float]
+"""Values of settings by name; `modes` is the paper's K."""
+_DECADE = 10.0
+
+
+def names(settings: Settings) -> dict[str, type]:
+    """The settings that members of one population may differ in, and their types."""
+    return traced_fields(SacSettings) | traced_fields(type(settings.options))
+
+
+def grid(axes: Mapping[str, Sequence[float]]) -> list[Values]:
+    """Every combination of the axes' values, the last axis changing fastest."""
+    return [
+        dict(zip(axes, values, strict=True))
+        for values in itertools.product(*axes.values())
+    ]
+
+
+def draws(
+    axes: Mapping[str, Sequence[float]], number: int, settings: Settings
+) -> list[Values]:
+    """Random configurations, the same for the same seed in the settings.
+
+    Args:
+      axes: name and range (low, high) of each setting, or one value that is kept.
+        Whole numbers are drawn from low to high; others log-uniformly where the range
+        lies above 0 and spans a factor of 10, else uniformly.
+      number: of configurations.
+      settings: tell which settings are whole numbers.
+
+    Raises:
+      UserError: a range that is none, or an unknown setting.
+    """
+    kinds = names(settings)
+    for name, values in axes.items():
+        for value in values:
+            _check(name, value, kinds)
+        require(
+            len(values) == 1 or (len(values) == 2 and values[0] < values[1]),
+            f"with --random, {flag(name)} needs a range, such as 0.1 10, or one value",
+        )
+    generator = np.random.default_rng(settings.seed)
+
+    def draw(name: str) -> float:
+        low, high = axes[name][0], axes[name][-1]
+        if low == high:
+            return low
+        if kinds[name] is int:
+            return int(generator.integers(int(low), int(high), endpoint=True))
+        if low > 0 and high / low >= _DECADE:
+            return math.exp(generator.uniform(math.log(low), math.log(high)))
+        return generator.uniform(low, high)
+
+    return [{name: draw(name) for name in axes} for _ in range(number)]
+
+
+def configure(settings: Settings, values: Mapping[str, float]) -> Settings:
+    """The settings with these values.
+
+    Raises:
+      UserError: an unknown setting, or a value that makes no sense.
+    """
+    kinds = names(settings)
+    sac: dict[str, Any] = {}
+    options: dict[str, Any] = {}
+    for name, value in values.items():
+        _check(name, value, kinds)
+        group = sac if hasattr(settings.sac, name) else options
+        group[name] = kinds[name](value)
+    settings = dataclasses.replace(
+        settings,
+        sac=dataclasses.replace(settings.sac, **sac),
+        options=dataclasses.replace(settings.options, **options),
+    )
+    validate(settings)
+    return dataclasses.replace(settings, options=settings.options.checked())
+
+
+def read(member: Member, name: str) -> float:
+    """A member's value of a setting."""
+    return getattr(member.sac if hasattr(member.sac, name) else member.options, name)
+
+
+def _check(name: str, value: float, kinds: Mapping[str, type]) -> None:
+    require(
+        name in kinds,
+        f"no sweep over {name!r}: choose among {', '.join(sorted(kinds))}",
+    )
+    word = flag(name)
+    require(math.isfinite(value), f"{word} must be finite, not {value}")
+    require(
+        kinds[name] is not int or value == int(value),
+        f"{word} must be a whole number, not {value:g}",
+    )

@@ -1,0 +1,100 @@
+"""Reads JSON: documents, and tables of lines, the last of which may have been cut."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from rewire_jax.core.errors import UserError
+
+T = TypeVar("T")
+
+# Raised on JSON that is not what was written here.
+_DAMAGE = (
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+)
+
+
+def table(
+    path: Path,
+    parse: Callable[[dict[str, Any]], tuple[tuple[int, ...], T]],
+    *,
+    needed: bool = True,
+) -> dict[tuple[int, ...], T]:
+    """Rows of a file by key; later rows replace earlier ones.
+
+    Args:
+        path: the file.
+        parse: from a row to its key and value; it may fail as in `reading`.
+        needed: otherwise a missing file is an empty table.
+
+    Raises:
+        UserError: the file is missing, or damaged elsewhere than in its last line.
+    """
+    if not needed and not path.exists():
+        return {}
+    lines = text(path).split("\n")
+    rows = {}
+    # What follows the last line break is empty, or a line that was cut.
+    for place, line in enumerate(lines[:-1], 1):
+        with reading(f"{path}, line {place}"):
+            key, value = parse(json.loads(line))
+            rows[key] = value
+    return rows
+
+
+def document(path: Path) -> Any:
+    """What a JSON file holds; `UserError` if it cannot be read, or is damaged."""
+    with reading(path):
+        return json.loads(text(path))
+
+
+@contextmanager
+def reading(what: Path | str) -> Iterator[None]:
+    """What fails inside because values are missing or odd is a `UserError`."""
+    try:
+        yield
+    except _DAMAGE as error:
+        why = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise UserError(f"{what} is damaged ({why[:200]})") from None
+
+
+def text(path: Path) -> str:
+    """What a file holds; `UserError` if it cannot be read."""
+    # A crash may cut inside a character; JSON then refuses the line as it should.
+    return raw(path).decode("utf-8", errors="replace")
+
+
+def raw(path: Path) -> bytes:
+    """The bytes of a file; `UserError` if it cannot be read."""
+    try:
+        # A device may have no end, and a pipe no beginning.
+        if path.exists() and not path.is_file():
+            raise UserError(f"cannot read {path}: not a file")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise UserError(f"{path} is missing: not the folder of a run") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from None
+
+
+def index(row: dict[str, Any], name: str, low: int, high: int) -> int:
+    """A row's place on an axis, from `low` to below `high`, else `ValueError`."""
+    value = int(row[name])
+    if not low <= value < high:
+        raise ValueError(f"{name} {value} is not in {low} to {high - 1}")
+    return value
+
+
+def number(value: float | None) -> float:
+    """A number of JSON, whose null stands for NaN."""
+    return np.nan if value is None else float(value)

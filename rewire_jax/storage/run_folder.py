@@ -1,0 +1,265 @@
+"""The files of a run: a header, and tables to which rows are appended.
+
+settings.json     settings, task names, network sizes, provenance
+results.jsonl     a row for each evaluation: stage, task, seed
+training.jsonl    a row for each progress report and seed
+timing.jsonl      a row for each progress report: wall-clock seconds
+checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
+.lock             is locked by the process that trains
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import importlib.metadata
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from rewire_jax.core.errors import UserError, writing
+from rewire_jax.core.settings import Settings, flag, from_json, to_json
+from rewire_jax.storage.json_lines import document, raw, reading
+from rewire_jax.version import __version__
+
+FORMAT = 1
+HEADER = "settings.json"
+TABLES = ("results.jsonl", "training.jsonl", "timing.jsonl")
+_LOCK = ".lock"
+Mark = Sequence[Any] | int
+"""Length of a table in bytes, and their SHA-256; older versions noted the length."""
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "mujoco", "orbax-checkpoint")
+
+
+def provenance() -> dict[str, Any]:
+    """What a result must be traced back by: command, commit, versions, device."""
+    root = Path(__file__).parents[2]
+    commit = "unknown"
+    # Installed, it may stand in the repository of something else.
+    if (root / ".git").exists():
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            commit = subprocess.run(
+                ["git", "-C", root, "describe", "--always", "--dirty", "--abbrev=12"],
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout.strip()
+    versions = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    versions["rewire_jax"] = __version__
+    devices = jax.devices()
+    return {
+        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "commit": commit,
+        "versions": versions,
+        "device": f"{len(devices)} x {devices[0].device_kind}, {os.cpu_count()} cores",
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+@contextlib.contextmanager
+def held(
+    folder: Path, header: Mapping[str, Any] | None, kind: str = "run"
+) -> Iterator[None]:
+    """Keeps the folder of a run from all other processes as long as this lasts.
+
+    Args:
+      folder: of the run or sweep.
+      header: of a new one; None to go on with the one that is there.
+      kind: of the one that is there.
+
+    Raises:
+      UserError: the folder holds something else, or cannot be written, or another
+        process trains in it.
+    """
+    if header is None:
+        read_header(folder, kind)
+    else:
+        _check_vacant(folder)
+        make(folder)
+    with writing(folder):
+        lock = (folder / _LOCK).open("a")
+    with lock:
+        try:
+            # The system lets go of it when the process ends, however that is.
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"another process trains in {folder}: wait for its end or stop it, "
+                "then go on with --resume; or name another folder with --out"
+            ) from None
+        except OSError:  # a file system without locks
+            pass
+        if header is not None:
+            _check_vacant(folder)  # Another process may have been faster.
+            write(folder / HEADER, {"format": FORMAT, **header})
+        yield
+
+
+def _check_vacant(folder: Path) -> None:
+    """Raises `UserError` if a folder holds more than a start that was cut short."""
+    with writing(folder):
+        others = folder.exists() and (
+            not folder.is_dir()
+            or {path.name for path in folder.iterdir()} - {_LOCK, f".{HEADER}"}
+        )
+    if others:
+        what = "another run" if (folder / HEADER).exists() else "something else"
+        raise UserError(
+            f"{folder} holds {what}: name another folder with --out, or continue "
+            "the run there with --resume"
+        )
+
+
+def make(folder: Path) -> None:
+    """Makes a folder that may be there; `UserError` if it cannot be made."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes JSON, all of it or nothing; `UserError` if it cannot be written."""
+    temporary = path.with_name(f".{path.name}")
+    try:
+        with writing(path):
+            temporary.write_text(json.dumps(content, indent=1) + "\n")
+            temporary.rename(path)
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def read_header(folder: Path, kind: str = "run") -> dict[str, Any]:
+    """The header of a run, or of a sweep.
+
+    Raises:
+      UserError: there is none, one of another format, or of the other kind.
+    """
+    # Unlike a Path's, it is False where one has no right to look.
+    if not os.path.exists(folder / HEADER):  # noqa: PTH110
+        raise UserError(f"{folder} holds no {kind}: there is no {HEADER} to be read")
+    header = document(folder / HEADER)
+    check_format(folder, header)
+    found = header.get("kind", "run")
+    if found != kind:
+        raise UserError(f"{folder} holds a {found}, not a {kind}")
+    with reading(folder / HEADER):
+        if not isinstance(header["settings"]["method"], str):
+            raise ValueError("method is no name")
+    return header
+
+
+def check_format(folder: Path, header: Any) -> None:
+    """Raises `UserError` if a folder's header is of another format."""
+    found = header.get("format") if isinstance(header, dict) else None
+    if found != FORMAT:
+        with telling_version(folder, header):
+            raise UserError(f"it has format {found}, not {FORMAT}")
+
+
+@contextlib.contextmanager
+def telling_version(folder: Path, header: Any) -> Iterator[None]:
+    """A `UserError` inside also says which version wrote a folder, by its header."""
+    try:
+        yield
+    except UserError as error:
+        try:
+            how = header["provenance"]
+            written = f"{how['versions']['rewire_jax']}, commit {how['commit']}"
+        except (KeyError, TypeError):
+            written = "of an unknown version"
+        raise UserError(
+            f"{folder} does not fit rewire_jax {__version__}: {error}; it was written "
+            f"by rewire_jax {written}: use that, or start anew in another folder"
+        ) from error
+
+
+def kind(folder: Path) -> str:
+    """What a folder holds: "run", also where that cannot be told, or "sweep"."""
+    try:
+        return document(folder / HEADER).get("kind", "run")
+    except (UserError, AttributeError):
+        return "run"
+
+
+def compare(folder: Path, settings: Settings, kind: str = "run") -> None:
+    """Raises `UserError` if a folder's run or sweep has other settings."""
+
+    def flat(data: dict[str, Any]) -> dict[str, Any]:
+        rows: dict[str, Any] = {}
+        for name, value in data.items():
+            rows |= flat(value) if isinstance(value, dict) else {name: value}
+        return rows
+
+    header = read_header(folder, kind)
+    saved = header["settings"]
+    if saved.get("method") == settings.method:
+        # What the run's version did not have was as it is by default.
+        with telling_version(folder, header):
+            saved = to_json(from_json(saved, type(settings.options)))
+    then = flat(saved)
+    now = flat(to_json(settings))
+    changed = [n for n in {**then, **now} if then.get(n) != now.get(n)]
+    if changed:
+        first = changed[0]
+        raise UserError(
+            f"{folder} was started with other settings: {flag(first)} was "
+            f"{then.get(first)}, not {now.get(first)}; drop it or name another --out"
+        )
+
+
+def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Adds rows to a table; `UserError` if they cannot be written."""
+    text = "".join(json.dumps(row) + "\n" for row in rows)
+    with writing(folder / table), (folder / table).open("a") as file:
+        file.write(text)
+
+
+def marks(folder: Path) -> dict[str, Mark]:
+    """Where each table ends, to come back to with `cut`."""
+    found: dict[str, Mark] = {}
+    for table in TABLES:
+        held = _bytes(folder / table)
+        found[table] = len(held), _digest(held)
+    return found
+
+
+def changed(folder: Path, marks: Mapping[str, Mark]) -> Path | None:
+    """A table that does not begin as it was when `marks` were taken, None if all do."""
+    for table, mark in marks.items():
+        length, digest = _parts(mark)
+        held = _bytes(folder / table)[:length]
+        if len(held) < length or (digest and _digest(held) != digest):
+            return folder / table
+    return None
+
+
+def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
+    """Forgets what was written after `marks` were taken; of other tables everything.
+
+    Raises:
+      UserError: a table cannot be written.
+    """
+    for table in TABLES:
+        path = folder / table
+        length, _ = _parts(marks.get(table, 0))
+        with writing(path):
+            if path.exists() and path.stat().st_size > length:
+                os.truncate(path, length)
+
+
+def _parts(mark: Mark) -> tuple[int, str]:
+    return (mark, "") if isinstance(mark, int) else (mark[0], mark[1])
+
+
+def _bytes(path: Path) -> bytes:
+    return raw(path) if path.exists() else b""
+
+
+def _digest(held: bytes) -> str:
+    return hashlib.sha256(held).hexdigest()

@@ -1,0 +1,1 @@
+"""The device's side: SAC, replay, rollouts, the compiled loop of a population."""

@@ -1,0 +1,111 @@
+"""Exploring actions, and the noise that they may take."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.core.settings import SacSettings
+from rewire_jax.methods.base import Memory, Method, Params
+from rewire_jax.nn import networks
+from rewire_jax.training import colored_noise
+
+
+class Draw(NamedTuple):
+    """What a step of all environments of a member leaves to chance.
+
+    Attributes:
+      context: key of the method's context, `[2]` uint32.
+      label: key of the method's label, `[2]` uint32.
+      noise: `[envs, actions]`, of the policy's actions.
+      uniform: `[envs, actions]`, actions that take no heed of the policy.
+      blind: `[]` bool, whether these are taken.
+    """
+
+    context: jax.Array
+    label: jax.Array
+    noise: jax.Array
+    uniform: jax.Array
+    blind: jax.Array
+
+
+def draw(
+    key: jax.Array,
+    time: jax.Array,
+    size: tuple[int, int],
+    random: int,
+    sequence: jax.Array | None,
+) -> Draw:
+    """A draw for one step.
+
+    Args:
+      key: a random key.
+      time: `[]` int, steps of all environments made before in the task.
+      size: of the actions, `envs, actions`.
+      random: steps in the task whose actions are uniform.
+      sequence: the coloured noise that `time` lies in, None where noise is white.
+    """
+    context_key, action_key, random_key, label_key = jax.random.split(key, 4)
+    if sequence is None:
+        noise = jax.random.normal(action_key, size)
+    else:
+        noise = sequence[time % len(sequence)]
+    return Draw(
+        context=jax.random.key_data(context_key),
+        label=jax.random.key_data(label_key),
+        noise=noise,
+        uniform=jax.random.uniform(random_key, size, minval=-1.0),
+        blind=time < random,
+    )
+
+
+def explore(
+    draw: Draw,
+    acting: tuple[Params, Memory],
+    label: Any,
+    observation: jax.Array,
+    steps: jax.Array,
+    method: Method,
+) -> tuple[jax.Array, Any]:
+    """Exploring actions of all environments of a member.
+
+    Args:
+      draw: what is left to chance.
+      acting: the method's parameters and memory.
+      label: the method's, of the step before.
+      observation: `[envs, observations]`.
+      steps: `[envs]` int, of the running episodes.
+      method: the method.
+
+    Returns:
+      Actions `[envs, actions]`, and the label that belongs to the step.
+    """
+    params, memory = acting
+    label_key, context_key = map(jax.random.wrap_key_data, (draw.label, draw.context))
+    label = method.label(label_key, memory, label, steps)
+    context = method.context(context_key, memory, "act", label)
+    mean, log_std = method.distribution(params, memory, context, observation)
+    action, _ = networks.sample_action(draw.noise, mean, log_std)
+    return jnp.where(draw.blind, draw.uniform, action), label
+
+
+def draw_sequence(
+    key: jax.Array,
+    time: jax.Array,
+    size: tuple[int, ...],
+    length: int,
+    settings: SacSettings,
+) -> jax.Array:
+    """Coloured noise `[length, *size]`, as long as an episode, that a step lies in.
+
+    Args:
+      key: the task's, as in `train`.
+      time: `[]` int, of the step.
+      size: of the noise in a step.
+      length: of an episode.
+      settings: SAC's.
+    """
+    # A key that the steps do not use.
+    start_key = jax.random.fold_in(key, time - time % length)
+    sequence_key = jax.random.split(start_key, 4)[3]
+    return colored_noise.colored(sequence_key, settings.noise_color, length, size)

@@ -1,0 +1,147 @@
+"""Episodes of simulators on the host: begun, advanced, and taken up again.
+
+They look like those of compiled environments, `[members, envs]` on the host. What is in
+the middle of an episode is known by its seed and the actions since, which lie in the
+replay buffer: where the simulators are not where a state says, they are brought there
+by playing these again.
+"""
+
+# NumPy's arrays stand where the records below have JAX's.
+# mypy: disable-error-code="arg-type"
+
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs.base import HostEnvironment, State, Task
+from rewire_jax.envs.vector_env import Lanes, draw_seed, shown
+from rewire_jax.training import rollout
+from rewire_jax.training.rollout import Episode, Step, Success
+
+Array = NDArray[Any]
+
+
+def seeds(roots: Array, number: Array) -> Array:
+    """Seeds `[members, envs]` of each environment's so many-th episode."""
+    return np.array(
+        [
+            [draw_seed(*root, env, of) for env, of in enumerate(row)]
+            for root, row in zip(roots, number, strict=True)
+        ]
+    )
+
+
+def begin(environment: HostEnvironment, number: Array, observation: Array) -> Any:
+    """Environments `[members, envs]` at the start of an episode.
+
+    An environment's inner state is the number of its episode. Unlike compiled ones it
+    keeps no start: the next episode has one of its own.
+
+    Args:
+      environment: theirs.
+      number: `[members, envs]` int32, of the episodes.
+      observation: `[members, envs, observations]`.
+    """
+    shape = number.shape
+    false, zero = np.zeros(shape, bool), np.zeros(shape, np.float32)
+    known = environment.success
+    state = State(number, observation, zero, false, false if known else ())
+    success = Success(false, false) if known else ()
+    return Episode(state, (), np.zeros(shape, np.int32), zero, success)
+
+
+def advance(
+    environment: HostEnvironment,
+    lanes: Lanes,
+    task: Task,
+    roots: Array,
+    episodes: Any,
+    action: Array,
+) -> tuple[Any, Step]:
+    """Steps all environments; ended episodes are followed by new ones.
+
+    Args:
+      environment: theirs.
+      lanes: where they are, as the episodes say.
+      task: the current task.
+      roots: `[members, 2]` uint32, what the members' episodes are drawn from.
+      episodes: as `begin` gave them.
+      action: `[members, envs, actions]`.
+
+    Returns:
+      The episodes after it, and the step, `[members, envs]`.
+    """
+    shape = episodes.steps.shape
+    scaled = action * np.asarray(task.action_scale)
+    moment = lanes.step(scaled.reshape(-1, action.shape[-1]))
+    last = following = shown(moment.observation, task, shape)
+    reward, terminal = moment.reward.reshape(shape), moment.terminal.reshape(shape)
+    known = environment.success
+    solved = moment.success.reshape(shape) if known else ()
+    steps, score = episodes.steps + np.int32(1), episodes.score + reward
+    truncated = (steps >= environment.episode_length) & ~terminal
+    success = rollout.succeed(episodes.success, solved)
+    ended, number = terminal | truncated, episodes.state.inner
+    after = steps, score, success
+    if ended.any():
+        number = number + ended.astype(np.int32)
+        begun = seeds(roots, number).ravel()
+        following = shown(lanes.reset(lanes.task, begun, ended.ravel()), task, shape)
+        after = jax.tree.map(lambda x: np.where(ended, np.zeros_like(x), x), after)
+    return Episode(
+        State(number, following, reward, terminal, solved), (), *after
+    ), Step(reward, terminal, truncated, last, following, score, success)
+
+
+def recall(
+    lanes: Lanes, task: Task, roots: Array, episodes: Any, buffer: Any, time: int
+) -> None:
+    """Brings the simulators where the episodes are, by playing them again.
+
+    Args:
+      lanes: wherever they are.
+      task: the current task.
+      roots: as in `advance`.
+      episodes: as in `advance`.
+      buffer: replay buffers `[members]`, which hold the episodes' actions.
+      time: steps of all environments in the buffers.
+
+    Raises:
+      UserError: they come out elsewhere.
+    """
+    begun, steps = seeds(roots, episodes.state.inner).ravel(), episodes.steps.ravel()
+
+    def there() -> bool:
+        seen = shown(lanes.observation, task, episodes.steps.shape)
+        return (
+            lanes.task == int(task.physics)
+            and np.array_equal(lanes.seeds, begun)
+            and np.array_equal(lanes.steps, steps)
+            and np.array_equal(seen, episodes.state.observation, equal_nan=True)
+        )
+
+    if there():
+        return
+    longest = int(steps.max())
+    lanes.reset(int(task.physics), begun)
+    rows = buffer.action.shape[1]
+    # The shorter ones join later, so that all are there at the same time.
+    for number in range(longest):
+        if number and (joins := steps == longest - number).any():
+            lanes.reset(lanes.task, begun, joins)
+        action = np.asarray(buffer.action[:, (time - longest + number) % rows])
+        action = action * np.asarray(task.action_scale)
+        moment = lanes.step(action.reshape(len(begun), -1))
+        if moment.terminal.any():  # in those that join later
+            lanes.reset(lanes.task, begun, moment.terminal)
+    if longest and (joins := steps == 0).any():
+        lanes.reset(lanes.task, begun, joins)
+    if not there():
+        raise UserError(
+            "the simulator does not repeat the episode that the checkpoint lies in: go "
+            "on where it was written, with the same versions, or delete the checkpoint "
+            "with -step- in its name, to repeat the task"
+        )

@@ -1,0 +1,294 @@
+"""The loop of a task whose environments are stepped on the host.
+
+It makes the same steps, updates and random draws as `training.train`; only where
+environments are stepped differs.
+"""
+
+# NumPy's arrays stand where the records below have JAX's.
+# mypy: disable-error-code="arg-type"
+
+import functools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from numpy.typing import NDArray
+
+from rewire_jax.envs.base import HostEnvironment, Task
+from rewire_jax.envs.vector_env import open_lanes, shown
+from rewire_jax.methods.base import Method
+from rewire_jax.training import exploration, host_episodes, population, train_loop
+from rewire_jax.training.host_rollout import play
+from rewire_jax.training.population import Members
+from rewire_jax.training.rollout import Rollout, Step
+from rewire_jax.training.train_loop import Collection, Report, Shape
+
+Array = NDArray[Any]
+
+
+class Loop(NamedTuple):
+    """The functions of a program that step environments; see `compiled_functions.Program`."""
+
+    begin: Callable[..., train_loop.State]
+    chunk: Callable[..., tuple[train_loop.State, Report]]
+    rollout: Callable[..., Rollout]
+    expect: Callable[..., train_loop.State]
+    traces: Callable[[], int]
+
+
+class _Functions(NamedTuple):
+    """What is compiled; the first axis of all is `[members]`.
+
+    Attributes:
+      roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
+      begin: `(members, learner, alive, index, episodes) -> State`.
+      draws: `(members, index, time) -> exploring.Draw` `[members, every]`, of the
+        next steps: drawn for each alone, they would take half of an action's time.
+      act: `(members, draws, number, acting, label, observation, steps) -> actions,
+        label`, by the draw with that number; on the CPU, where it waits for no other
+        device's updates.
+      absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
+        buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
+        are due after them; what is given is used up, but for the learner with overlap.
+      inspect: `(members, learner, buffer, index, time) -> metrics`.
+    """
+
+    roots: Callable[..., jax.Array]
+    begin: Callable[..., train_loop.State]
+    draws: Callable[..., exploration.Draw]
+    act: Callable[..., tuple[jax.Array, Any]]
+    absorb: Callable[..., tuple[Any, Any, Any, Any]]
+    inspect: Callable[..., dict[str, jax.Array]]
+
+
+def loop(
+    environment: HostEnvironment,
+    make: Callable[[Any], Method],
+    act: Callable[..., Any],
+    task_keys: Callable[[Any, Any], jax.Array],
+    begin: Callable[..., train_loop.State],
+    shape: Shape,
+    mesh: Mesh,
+) -> Loop:
+    """The loop's functions.
+
+    Args:
+      environment: stepped on the host.
+      make: `member -> Method`.
+      act: `Method.act`.
+      task_keys: `(member, index) -> keys`, those of a task's start and steps first.
+      begin: `(member, learner, alive, index, episodes) -> State`, a task's start.
+      shape: sizes of the loop.
+      mesh: the devices.
+    """
+    functions = _compile(environment, make, task_keys, begin, shape, mesh)
+    counted: list[Any] = [functions.act, functions.absorb]
+
+    def first(members, index, task):
+        shaped = len(members.keys), shape.envs
+        lanes = open_lanes(environment, shaped[0] * shaped[1])
+        number = np.zeros(shaped, np.int32)
+        seeds = host_episodes.seeds(np.asarray(functions.roots(members, index)), number)
+        observation = lanes.reset(int(task.physics), seeds.ravel())
+        return host_episodes.begin(
+            environment, number, shown(observation, task, shaped)
+        )
+
+    def start(members, learner, alive, index, task):
+        episodes = population.place(first(members, index, task), mesh)
+        return functions.begin(members, learner, alive, index, episodes)
+
+    def expect(members, learner, alive, index, task):
+        number = np.zeros((len(members.keys), shape.envs), np.int32)
+        observation = np.zeros((*number.shape, environment.observation_size))
+        episodes = host_episodes.begin(
+            environment, number, observation.astype(np.float32)
+        )
+        return jax.eval_shape(functions.begin, members, learner, alive, index, episodes)
+
+    return Loop(
+        begin=start,
+        chunk=functools.partial(_chunk, environment, functions, shape, mesh),
+        rollout=functools.partial(play, environment, shape.envs, act),
+        expect=expect,
+        traces=lambda: sum(function._cache_size() for function in counted),
+    )
+
+
+def _compile(
+    environment: HostEnvironment,
+    make: Callable[[Any], Method],
+    task_keys: Callable[[Any, Any], jax.Array],
+    begin: Callable[..., train_loop.State],
+    shape: Shape,
+    mesh: Mesh,
+) -> _Functions:
+    length, size = environment.episode_length, (shape.envs, environment.action_size)
+
+    def roots(member, index):
+        return jax.random.key_data(jax.random.split(task_keys(member, index)[0], 4)[1])
+
+    def draws(member, index, time):
+        key, sac = task_keys(member, index)[1], member.sac
+        sequences = None
+        if sac.noise_color:
+            # All that a turn may touch, each drawn once.
+            starts = time + length * jnp.arange((shape.every - 2) // length + 2)
+            sequences = jax.vmap(
+                lambda start: exploration.draw_sequence(key, start, size, length, sac)
+            )(starts)
+
+        def of(now):
+            sequence = None
+            if sequences is not None:
+                sequence = sequences[now // length - time // length]
+            collect_key, _ = jax.random.split(jax.random.fold_in(key, now))
+            return exploration.draw(collect_key, now, size, shape.random, sequence)
+
+        return jax.vmap(of)(time + jnp.arange(shape.every))
+
+    def act(members, draws, number, acting, label, observation, steps):
+        def one(member, draws, acting, label, observation, steps):
+            draw = jax.tree.map(lambda leaf: leaf[number], draws)
+            method = make(member)
+            return exploration.explore(draw, acting, label, observation, steps, method)
+
+        return jax.vmap(one)(members, draws, acting, label, observation, steps)
+
+    def absorb(member, learner, buffer, alive, index, time, played):
+        def store(number, buffer):
+            action, label, step = jax.tree.map(lambda leaf: leaf[number], played)
+            at = time + number
+            return train_loop.store(buffer, at, action, label, step, length)
+
+        buffer = jax.lax.fori_loop(0, shape.every, store, buffer)
+        done = time + shape.every
+        key = jax.random.fold_in(task_keys(member, index)[1], done - 1)
+        state, metrics = train_loop.follow(
+            jax.random.split(key)[1],
+            train_loop.State(learner, Collection(buffer, (), ()), alive),
+            done,
+            environment=environment,
+            method=make(member),
+            settings=member.sac,
+            shape=shape,
+        )
+        return state.learner, buffer, state.alive, metrics
+
+    def inspect(member, learner, buffer, index, time):
+        state = train_loop.State(learner, Collection(buffer, (), ()), jnp.asarray(True))
+        key, method = task_keys(member, index)[1], make(member)
+        return train_loop.inspect(key, state, time, length, method, member.sac)
+
+    over = functools.partial(population.over, mesh)
+
+    return _Functions(
+        roots=over(roots, 0, None),
+        begin=over(begin, 0, 0, 0, None, 0),
+        draws=over(draws, 0, None, None),
+        # Called at each step, and so not through `shard_map`, which takes its time.
+        act=jax.jit(act),
+        # With overlap the former learner acts meanwhile, and must be left.
+        absorb=over(
+            absorb, 0, 0, 0, 0, None, None, 0, donate=(2,) if shape.overlap else (1, 2)
+        ),
+        inspect=over(inspect, 0, 0, 0, None, None),
+    )
+
+
+def _chunk(
+    environment: HostEnvironment,
+    functions: _Functions,
+    shape: Shape,
+    mesh: Mesh,
+    members: Members,
+    state: train_loop.State,
+    index: int,
+    task: Task,
+    time: int,
+    steps: int,
+) -> tuple[train_loop.State, Report]:
+    """Collects and learns for some steps, a multiple of `Shape.every`."""
+    assert steps % shape.every == 0
+    learner, (buffer, episodes, label), alive, acting = state
+    episodes = jax.tree.map(np.asarray, episodes)
+    lanes = open_lanes(environment, episodes.steps.size)
+    roots = np.asarray(functions.roots(members, index))
+    host_episodes.recall(lanes, task, roots, episodes, buffer, time)
+    # What is asked for at each step must lie ready.
+    task = jax.tree.map(np.asarray, task)
+    cpu = jax.local_devices(backend="cpu")[0]
+    here = functools.partial(jax.device_put, device=cpu)
+    actors, label = here(members), here(label)
+    acting = here(acting or (learner.params, learner.memory))
+    learning: Any = None
+    made, metrics, updates = [], [], 0
+    # JAX begins what one thread asks for in turn: actions would wait for updates.
+    with ThreadPoolExecutor(1) as other:
+        for start in range(time, time + steps, shape.every):
+            played = []
+            draws = here(functions.draws(members, index, start))
+            for number in range(shape.every):
+                drawn, label = functions.act(
+                    actors,
+                    draws,
+                    number,
+                    acting,
+                    label,
+                    episodes.state.observation,
+                    episodes.steps,
+                )
+                action = np.asarray(drawn)
+                episodes, step = host_episodes.advance(
+                    environment, lanes, task, roots, episodes, action
+                )
+                played.append((action, jax.tree.map(np.asarray, label), step))
+            along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
+            made.append(along[2])
+            updates += int(shape.due(start + shape.every))
+            if learning:
+                learner, buffer, alive, values = learning.result()
+                metrics.append(values)
+            before = learner
+            learning = other.submit(
+                functions.absorb, members, learner, buffer, alive, index, start, along
+            )
+            newest = before if shape.overlap else learning.result()[0]
+            acting = here((newest.params, newest.memory))
+        learner, buffer, alive, values = learning.result()
+        metrics.append(values)
+    totals = jax.tree.map(lambda *values: sum(map(np.asarray, values)), *metrics)
+    end = time + steps
+    report = _report(made, totals, updates)._replace(
+        inspected=functions.inspect(members, learner, buffer, index, end)
+    )
+    episodes, label = population.place((episodes, label), mesh)
+    return train_loop.State(
+        learner,
+        Collection(buffer, episodes, label),
+        alive,
+        population.place(acting, mesh) if shape.overlap else (),
+    ), report
+
+
+def _report(made: list[Step], metrics: Any, updates: int) -> Report:
+    """What a chunk's steps `[members, every, envs]` each sum up to."""
+    step = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *made)
+    ended = step.terminal | step.truncated
+
+    def total(values):
+        return np.sum(np.where(ended, values, 0), axis=(1, 2))
+
+    return Report(
+        episodes=total(1),
+        returns=total(step.score),
+        rewards=step.reward.mean(axis=2).sum(axis=1),
+        updates=np.full(len(ended), updates),
+        metrics=metrics,
+        inspected={},
+        successes=jax.tree.map(total, step.success),
+    )

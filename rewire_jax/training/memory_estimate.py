@@ -1,0 +1,292 @@
+"""What a member needs of a device's memory, known before anything is compiled.
+
+What is held is counted from shapes. What computing takes beside it is counted from the
+traced operations: the most that is alive at once, if each result is kept from where it
+is made to its last use. XLA needs less where it fuses operations, and more where it
+copies.
+"""
+
+import functools
+import math
+import os
+import resource
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import require
+from rewire_jax.envs.base import HostEnvironment
+from rewire_jax.methods import find_method
+from rewire_jax.methods.base import map_own
+from rewire_jax.training import colored_noise, rollout, train_loop
+from rewire_jax.training.run_setup import Plan
+
+# Of a device's memory; the rest is for compiled code and what others hold.
+_SHARE = 0.8
+# With more a CPU's caches are too small, and each takes longer.
+_SIDE_BY_SIDE = 8
+
+
+class Need(NamedTuple):
+    """Bytes that one member needs.
+
+    Attributes:
+      learner: all that learning changes.
+      buffer: the replay buffer, held in training.
+      environments: held in training.
+      work: taken for a while beside these, by an update, a step or a choice.
+      evaluation: taken beside the learner, when there is no buffer; also to choose
+        between policies at a task's end.
+    """
+
+    learner: int
+    buffer: int
+    environments: int
+    work: int
+    evaluation: int
+
+    @property
+    def total(self) -> int:
+        """The most at any one time."""
+        training = self.buffer + self.environments + self.work
+        return self.learner + max(training, self.evaluation)
+
+    def __str__(self) -> str:
+        pairs = zip(self._fields, self, strict=True)
+        parts = ", ".join(f"{name} {size / 1e6:.3g}" for name, size in pairs)
+        return f"a member needs {self.total / 1e6:.3g} MB: {parts}"
+
+
+def _held(plan: Plan) -> tuple[Any, Any]:
+    """Shapes of a learner between tasks, and of all that is held within one."""
+    task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
+    fresh = jax.eval_shape(plan.program.init, plan.members)
+    alive = jax.ShapeDtypeStruct((plan.places,), bool)
+    return fresh, plan.program.expect(plan.members, fresh, alive, 0, task)
+
+
+def check(plan: Plan) -> None:
+    """Raises `UserError` if what is held in training alone is more than there is."""
+    held = size(_held(plan)[1])
+    room = _total(list(plan.mesh.devices.flat))
+    require(
+        room is None or held <= room,
+        f"a run of this size holds {held / 1e9:.3g} GB, and there are "
+        f"{(room or 0) / 1e9:.3g}: lower --seeds, --buffer, --envs or --hidden",
+    )
+
+
+def need(plan: Plan) -> Need:
+    """Counts what each member of a plan needs; traces, but compiles nothing."""
+    program, settings, spec = plan.program, plan.settings, plan.spec
+    environment, make = plan.scenario.environment, find_method(settings.method).make
+    fresh, state = _held(plan)
+
+    def learn(member, state):
+        return train_loop.learn(
+            member.keys,
+            state,
+            jnp.asarray(1),
+            jnp.asarray(0),
+            True,
+            updates=settings.updates,
+            environment=environment,
+            method=make(spec, member.options),
+            settings=member.sac,
+        )
+
+    def cut(tree: Any, *shape: int, axes: int = 1) -> Any:
+        """Shapes whose first `axes` axes are replaced."""
+        return jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((*shape, *x.shape[axes:]), x.dtype), tree
+        )
+
+    def play(policies: Any, rows: int, episodes: int) -> int:
+        """For a member's policies, in as many tasks, and episodes of each of these."""
+        policies = map_own(lambda x: cut(x, 1, rows, axes=2), cut(policies, 1))
+        if isinstance(environment, HostEnvironment):
+            return size(policies)  # episodes take nothing of the device
+        act = make(spec, settings.options).act
+
+        def roll(tasks, policies, keys):
+            return rollout.episodes(environment, act, tasks, policies, keys, episodes)
+
+        keys = cut(plan.members.keys, 1, rows)
+        return size(policies) + peak(roll, cut(plan.tasks, rows), policies, keys)
+
+    member, mine = cut(plan.members), cut(state)
+    policies = jax.eval_shape(program.policies, plan.members, fresh)
+    learner = size(mine.learner)
+    work = [
+        learner,  # a task's start and end each make one from the other
+        peak(learn, member, mine),
+        play(policies, 1, settings.envs),
+    ]
+    if program.consolidate:
+        work.append(peak(program.consolidate, plan.members, state, 0, 1) // plan.places)
+    selection = 0
+    if program.candidates and plan.rows:
+        chosen = jax.eval_shape(program.candidates, plan.members, fresh, 0)
+        selection = play(chosen.policies, plan.rows, settings.selection_episodes)
+    if program.baseline:
+        work.append(selection)
+    environments = size(mine.collection) - size(mine.collection.buffer)
+    environments += size(mine.acting)
+    if settings.sac.noise_color:
+        draw = functools.partial(
+            colored_noise.colored,
+            color=settings.sac.noise_color,
+            length=environment.episode_length,
+            shape=(settings.envs, environment.action_size),
+        )
+        environments += size(jax.eval_shape(draw, member.keys))
+        work.append(peak(draw, member.keys))
+    return Need(
+        learner=learner,
+        buffer=size(mine.collection.buffer),
+        environments=environments,
+        work=max(work),
+        evaluation=max(
+            play(policies, settings.tasks, settings.eval_episodes), selection
+        ),
+    )
+
+
+def size(tree: Any) -> int:
+    """Bytes of a pytree's arrays, which may be abstract."""
+    return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def peak(function: Callable[..., Any], *arguments: Any) -> int:
+    """Bytes that a function's results take at most at a time, beside its arguments."""
+    return _peak(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _peak(jaxpr: Jaxpr) -> int:
+    last = {
+        v: i for i, e in enumerate(jaxpr.eqns) for v in (*e.outvars, *_variables(e))
+    }
+    last |= dict.fromkeys((v for v in jaxpr.outvars if isinstance(v, Var)), -1)
+    held: dict[Var, int] = {}
+    alive = most = 0
+    for index, equation in enumerate(jaxpr.eqns):
+        made = {v: size(v.aval) for v in equation.outvars}
+        given = sum(made.values())
+        inside = max(map(_peak, jaxprs_in_params(equation.params)), default=0)
+        if equation.primitive.name in ("scan", "while"):
+            # What it carries is kept while the next is made.
+            inside += given
+        most = max(most, alive + max(inside, given))
+        held |= made
+        held = {v: bytes for v, bytes in held.items() if last[v] != index}
+        alive = sum(held.values())
+    return most
+
+
+def _variables(equation: JaxprEqn) -> list[Var]:
+    return [v for v in equation.invars if isinstance(v, Var)]
+
+
+def device_bytes(devices: Sequence[jax.Device]) -> int:
+    """Bytes on these devices together that members may take.
+
+    Raises:
+      UserError: a device does not tell.
+    """
+    total = _total(devices)
+    if total is None:
+        raise UserError(
+            f"{devices[0].device_kind} does not tell its memory: give "
+            "--members-per-batch"
+        )
+    return int(_SHARE * total)
+
+
+def _total(devices: Sequence[jax.Device]) -> int | None:
+    """Bytes of these devices together; None if one does not tell."""
+    if devices[0].platform == "cpu":
+        # All CPU devices are one machine.
+        return machine_bytes()
+    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in devices]
+    known = [limit for limit in limits if limit]
+    return sum(known) if len(known) == len(limits) else None
+
+
+def most_held() -> dict[str, int]:
+    """Bytes held at most so far.
+
+    Returns:
+      `process`: by this process on its machine; `device`: by all its devices together,
+      where they have memory of their own and tell.
+    """
+    # In kilobytes, but on macOS.
+    unit = 1 if sys.platform == "darwin" else 1024
+    held = {"process": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
+    stats = [device.memory_stats() or {} for device in jax.local_devices()]
+    peaks = [each["peak_bytes_in_use"] for each in stats if "peak_bytes_in_use" in each]
+    return held | ({"device": sum(peaks)} if peaks else {})
+
+
+def machine_bytes(root: Path = Path("/")) -> int:
+    """Bytes of the machine's memory, or of this process's share of it (cgroups).
+
+    Args:
+      root: of the file system.
+    """
+    pages, page = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
+    return min([pages * page, *_limits(root)])
+
+
+def _limits(root: Path) -> Iterator[int]:
+    """Of the control groups that the process is in; there are two versions of them."""
+    try:
+        groups = (root / "proc/self/cgroup").read_text().splitlines()
+    except OSError:  # not Linux
+        return
+    for group in groups:
+        _, controllers, path = group.split(":", 2)
+        if "memory" in controllers.split(","):
+            top, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
+        elif not controllers:
+            top, name = root / "sys/fs/cgroup", "memory.max"
+        else:
+            continue
+        inner = top / path.lstrip("/")
+        for folder in (inner, *inner.parents):
+            # In a container the path may be one of the machine outside.
+            text = _text(folder / name)
+            if text.isdecimal():  # not "max"
+                yield int(text)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text().strip()
+    except OSError:
+        return ""
+
+
+def fitting(each: Need, devices: Sequence[jax.Device]) -> int:
+    """How many such members are best trained side by side on these devices.
+
+    Raises:
+      UserError: there is no room for one.
+    """
+    room = device_bytes(devices)
+    # On a CPU all devices take from the same room.
+    shares = 1 if devices[0].platform == "cpu" else len(devices)
+    number = shares * (room // shares // each.total)
+    require(
+        number > 0,
+        f"{each}; there are {room / shares / 1e6:.3g} MB: lower --buffer, --envs or "
+        "--eval-episodes, or give --members-per-batch to try",
+    )
+    if devices[0].platform == "cpu":
+        number = min(number, _SIDE_BY_SIDE * len(devices))
+    return number

@@ -1,0 +1,170 @@
+"""Members of a population: configurations times seeds, and where they live."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import SacSettings
+
+_AXIS = "members"
+_LONGEST = 1_000  # bytes that processes tell each other
+
+
+class Member(NamedTuple):
+    """One member.
+
+    Attributes:
+      number: its own in the run or sweep.
+      name: for people.
+      seed: all its randomness follows from it.
+      sac: SAC's settings.
+      options: the method's settings.
+    """
+
+    number: int
+    name: str
+    seed: int
+    sac: SacSettings
+    options: Any
+
+
+class Members(NamedTuple):
+    """What tells the members of a population apart, `[members]` on every leaf.
+
+    Attributes:
+      keys: random keys, made from the seed alone.
+      sac: SAC's settings.
+      options: the method's settings.
+    """
+
+    keys: jax.Array
+    sac: SacSettings
+    options: Any
+
+
+def cross(
+    configurations: Sequence[tuple[SacSettings, Any]], seeds: Sequence[int]
+) -> tuple[Member, ...]:
+    """Every configuration with every seed, the seeds of one side by side."""
+    pairs = [(pair, seed) for pair in configurations for seed in seeds]
+    return tuple(
+        Member(number, f"seed {seed}", seed, *pair)
+        for number, (pair, seed) in enumerate(pairs)
+    )
+
+
+_make_keys = jax.jit(jax.vmap(jax.random.key))
+
+
+def stack(crowd: Sequence[Member]) -> Members:
+    """Members side by side; they may differ only in their traced numbers."""
+
+    def stacked(settings):
+        return jax.tree.map(
+            lambda *leaves: np.asarray(leaves, jnp.result_type(*leaves)), *settings
+        )
+
+    return Members(
+        keys=_make_keys(np.array([member.seed for member in crowd], np.uint32)),
+        sac=stacked([member.sac for member in crowd]),
+        options=stacked([member.options for member in crowd]),
+    )
+
+
+def join(coordinator: str, processes: int | None, process: int | None) -> None:
+    """Makes this process one of several that share the work.
+
+    Args:
+      coordinator: `host:port` of the first process.
+      processes: how many there are; None where a cluster manager that JAX knows
+        tells it this, and which process this is.
+      process: number of this process.
+
+    Raises:
+      UserError: numbers are missing or wrong, or the others cannot be reached.
+    """
+    try:
+        jax.distributed.initialize(coordinator, processes, process)
+    except (ValueError, TypeError, RuntimeError) as error:
+        said = str(error).partition("\n")[0]
+        raise UserError(
+            f"--coordinator {coordinator}: {said} Check the address, --processes and "
+            "--process."
+        ) from error
+
+
+def at_first(step: Callable[[], Any]) -> None:
+    """Has the first process make a step that comes before all others.
+
+    Raises:
+      UserError: the step's; in every process, which so end alike.
+    """
+    if jax.process_count() == 1:
+        step()
+        return
+    said = b""
+    if jax.process_index() == 0:
+        try:
+            step()
+        except UserError as error:
+            said = str(error).encode()[:_LONGEST]
+    sent = np.frombuffer(said.ljust(_LONGEST, b"\0"), np.uint8)
+    heard = np.asarray(multihost_utils.broadcast_one_to_all(sent), np.uint8)
+    if text := bytes(heard).rstrip(b"\0"):
+        raise UserError(text.decode(errors="replace"))
+
+
+def mesh(members: int) -> Mesh:
+    """As many of this process's devices as can have equal shares of the members."""
+    devices = jax.local_devices()
+    number = next(n for n in range(len(devices), 0, -1) if members % n == 0)
+    return Mesh(devices[:number], (_AXIS,))
+
+
+def place(tree: Any, mesh: Mesh) -> Any:
+    """Spreads a pytree with a leading axis `[members]` over the devices."""
+    return jax.device_put(tree, NamedSharding(mesh, P(_AXIS)))
+
+
+def compiled(
+    function: Callable[..., Any],
+    axes: Sequence[int | None],
+    mesh: Mesh,
+    donate: tuple[int, ...] = (),
+) -> Callable[..., Any]:
+    """A function of whole populations, to be compiled when it is first called.
+
+    Each device computes its own members and hears nothing of the others.
+
+    Args:
+      function: takes and gives `[members]` on a leading axis.
+      axes: for each argument 0, or None where all members share it.
+      mesh: the devices.
+      donate: arguments whose memory the result may take.
+    """
+    shares = tuple(P() if axis is None else P(_AXIS) for axis in axes)
+    # Members vary over devices and counters do not: what loops carry is both.
+    local = jax.shard_map(
+        function, mesh=mesh, in_specs=shares, out_specs=P(_AXIS), check_vma=False
+    )
+    # Said for one device, too: else its results and what `place` gives are two kinds of
+    # arguments, for which a function is traced twice.
+    spread = NamedSharding(mesh, P(_AXIS))
+    return jax.jit(local, donate_argnums=donate, out_shardings=spread)
+
+
+def over(
+    mesh: Mesh,
+    function: Callable[..., Any],
+    *axes: int | None,
+    donate: tuple[int, ...] = (),
+) -> Callable[..., Any]:
+    """A function of one member made one of whole populations, see `compiled`."""
+    return compiled(jax.vmap(function, axes), axes, mesh, donate)

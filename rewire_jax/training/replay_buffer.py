@@ -1,0 +1,184 @@
+"""A ring buffer of transitions that stores each observation once."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.core.transition import Batch
+
+
+class Replay(NamedTuple):
+    """Transitions of `envs` parallel environments, one row per time step.
+
+    The transition at time t lies in row t mod rows, and the observation that
+    follows it is the next row's. Only where an episode was cut off does the next
+    row hold something else (a fresh start): there, the true last observation is
+    kept in `final`. Two cuts in one environment are at least an episode's length
+    apart, so t // episode_length tells them apart.
+
+    The time is the caller's, equal for all members of a population: that keeps the
+    writes in place under vmap.
+
+    Attributes:
+      observation: `[rows, envs, observations]`.
+      action: `[rows, envs, actions]`.
+      reward: `[rows, envs]`.
+      terminal: `[rows, envs]` bool, ended by the task.
+      truncated: `[rows, envs]` bool, ended by the time limit.
+      final: `[cuts, envs, observations]`.
+      label: pytree of `[rows, envs, ...]`, what a method stores beside.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminal: jax.Array
+    truncated: jax.Array
+    final: jax.Array
+    label: Any = ()
+
+
+def create(
+    first: jax.Array,
+    *,
+    transitions: int,
+    actions: int,
+    episode_length: int,
+    label: Any = (),
+) -> Replay:
+    """An empty buffer.
+
+    Args:
+      first: `[envs, observations]`, the observations at time 0.
+      transitions: rows of transitions to hold; one more row is made, for the
+        observation after the last.
+      actions: length of an action.
+      episode_length: steps to a time limit.
+      label: pytree of `[envs, ...]`, an example of what is stored beside.
+    """
+    envs, size = first.shape
+    rows = transitions + 1
+    cuts = -(-rows // episode_length) + 1
+    return Replay(
+        observation=jnp.zeros((rows, envs, size), first.dtype).at[0].set(first),
+        action=jnp.zeros((rows, envs, actions), first.dtype),
+        reward=jnp.zeros((rows, envs), first.dtype),
+        terminal=jnp.zeros((rows, envs), bool),
+        truncated=jnp.zeros((rows, envs), bool),
+        final=jnp.zeros((cuts, envs, size), first.dtype),
+        label=jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), label),
+    )
+
+
+def add(
+    replay: Replay,
+    time: jax.Array,
+    *,
+    action: jax.Array,
+    reward: jax.Array,
+    terminal: jax.Array,
+    truncated: jax.Array,
+    last: jax.Array,
+    following: jax.Array,
+    episode_length: int,
+    label: Any = (),
+) -> Replay:
+    """Stores the transitions of one time step.
+
+    Args:
+      replay: the buffer.
+      time: `[]` int, steps since the buffer was made.
+      action: `[envs, actions]`.
+      reward: `[envs]`.
+      terminal: `[envs]` bool.
+      truncated: `[envs]` bool.
+      last: `[envs, observations]`, what the step led to.
+      following: `[envs, observations]`, the same but for ended episodes, where it
+        is the first observation of the next one.
+      episode_length: as in `create`.
+      label: as in `create`.
+    """
+    rows, cuts = replay.reward.shape[0], replay.final.shape[0]
+
+    def put(array, row, value):
+        return jax.lax.dynamic_update_index_in_dim(array, value, row, 0)
+
+    row, cut = time % rows, (time // episode_length) % cuts
+    kept = jax.lax.dynamic_index_in_dim(replay.final, cut, 0, keepdims=False)
+    return Replay(
+        observation=put(replay.observation, (time + 1) % rows, following),
+        action=put(replay.action, row, action),
+        reward=put(replay.reward, row, reward),
+        terminal=put(replay.terminal, row, terminal),
+        truncated=put(replay.truncated, row, truncated),
+        final=put(replay.final, cut, jnp.where(truncated[:, None], last, kept)),
+        label=jax.tree.map(lambda a, v: put(a, row, v), replay.label, label),
+    )
+
+
+def draw(
+    replay: Replay, key: jax.Array, time: jax.Array, shape: tuple[int, ...]
+) -> jax.Array:
+    """Places of transitions, uniform with replacement, as `take` takes them.
+
+    Args:
+      replay: the buffer.
+      key: a random key.
+      time: `[]` int, the number of time steps stored so far, at least 1.
+      shape: of the result.
+    """
+    rows, envs = replay.reward.shape
+    filled = jnp.minimum(time, rows - 1)
+    return jax.random.randint(key, shape, 0, filled * envs)
+
+
+def labels(replay: Replay, places: jax.Array, time: jax.Array) -> Any:
+    """What was stored beside the transitions at some places, see `take`."""
+    at, env = _find(replay, places, time)
+    row = at % len(replay.reward)
+    return jax.tree.map(lambda a: a[row, env], replay.label)
+
+
+def take(
+    replay: Replay, places: jax.Array, time: jax.Array, episode_length: int
+) -> Batch:
+    """The transitions at some places, counted from the latest back.
+
+    Args:
+      replay: the buffer.
+      places: `[batch]` int, less than the number of transitions held.
+      time: `[]` int, the number of time steps stored so far, at least 1.
+      episode_length: as in `create`.
+    """
+    rows = len(replay.reward)
+    at, env = _find(replay, places, time)
+    row = at % rows
+    cut = (at // episode_length) % replay.final.shape[0]
+    truncated = replay.truncated[row, env]
+    return Batch(
+        observation=replay.observation[row, env],
+        action=replay.action[row, env],
+        reward=replay.reward[row, env],
+        terminal=replay.terminal[row, env],
+        truncated=truncated,
+        next_observation=jnp.where(
+            truncated[:, None],
+            replay.final[cut, env],
+            replay.observation[(row + 1) % rows, env],
+        ),
+        label=labels(replay, places, time),
+    )
+
+
+def _find(replay, places, time):
+    """Times and environments of some places."""
+    envs = replay.reward.shape[1]
+    return time - 1 - places // envs, places % envs
+
+
+def sample(
+    replay: Replay, key: jax.Array, time: jax.Array, batch: int, episode_length: int
+) -> Batch:
+    """`batch` transitions, uniform with replacement; see `draw` and `take`."""
+    return take(replay, draw(replay, key, time, (batch,)), time, episode_length)

@@ -1,0 +1,322 @@
+"""Soft Actor-Critic: losses and one update, for one member."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from rewire_jax.core.settings import SacSettings
+from rewire_jax.core.transition import Batch
+from rewire_jax.methods.base import Memory, Method, Params, Spec
+from rewire_jax.nn import networks
+
+Metrics = dict[str, jax.Array]
+_ADAM = optax.scale_by_adam()
+_STATES = {"current": 1, "both": 2}  # of a transition, in the policy's losses
+
+
+class Learner(NamedTuple):
+    """All that learning changes.
+
+    Attributes:
+      params: the method's parameters.
+      memory: the method's memory.
+      critic: layers of both critics, stacked on a leading axis of 2.
+      target: the same, moving slowly after them.
+      log_temperature: `[]`.
+      optimizers: Adam's states of policy, critics and temperature.
+    """
+
+    params: Params
+    memory: Memory
+    critic: Any
+    target: Any
+    log_temperature: jax.Array
+    optimizers: tuple[Any, Any, Any]
+
+
+def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> Learner:
+    """A learner before its first task."""
+    policy_key, critic_key = jax.random.split(key)
+    params, memory = method.init(policy_key)
+    critic = init_critic(critic_key, spec, method.extra)
+    return restart(
+        Learner(params, memory, critic, critic, jnp.zeros(()), ((), (), ())), sac
+    )
+
+
+def init_critic(key: jax.Array, spec: Spec, extra: int) -> Any:
+    """Both critics, which see `extra` numbers beside observation and action."""
+    inputs = spec.observations + extra + spec.actions
+    sizes = [inputs, *[spec.hidden] * spec.depth, 1]
+    return jax.vmap(lambda k: networks.init_mlp(k, sizes))(jax.random.split(key))
+
+
+def restart(learner: Learner, sac: SacSettings) -> Learner:
+    """Fresh optimisers, temperature and targets, as at the start of every task."""
+    log_temperature = jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32))
+    return learner._replace(
+        # The targets start as copies of the critics that are kept.
+        target=learner.critic,
+        log_temperature=log_temperature,
+        optimizers=(
+            _ADAM.init(learner.params),
+            _ADAM.init(learner.critic),
+            _ADAM.init(log_temperature),
+        ),
+    )
+
+
+def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
+    """Both critics' values `[2, batch]`.
+
+    Args:
+      critic: layers of both.
+      inputs: `[batch, observations + extra]`, see `Method.critic_input`.
+      action: `[batch, actions]`.
+    """
+    inputs = jnp.concatenate([inputs, action], axis=-1)
+    # Of one input for both, XLA would make one product, then transpose it in two.
+    return jax.vmap(networks.mlp)(critic, jnp.stack([inputs, inputs]))[..., 0]
+
+
+class Draw(NamedTuple):
+    """What an update leaves to chance.
+
+    Attributes:
+      contexts: the method's, for the critics and for the policy.
+      noise: `[2 or 3, batch, actions]`, first of the critics' actions, then of the
+        policy's: in one or both states of each transition.
+      penalty: a key for the method's penalty.
+    """
+
+    contexts: tuple[Any, Any]
+    noise: jax.Array
+    penalty: jax.Array
+
+
+def draw(
+    key: jax.Array,
+    memory: Memory,
+    label: Any,
+    size: tuple[int, int],
+    method: Method,
+    sac: SacSettings,
+) -> Draw:
+    """A draw for one update.
+
+    Args:
+      key: a random key.
+      memory: the method's, which updates leave as it is.
+      label: of the update's transitions.
+      size: of its actions, `batch, actions`.
+      method: the method.
+      sac: SAC's settings.
+    """
+    critic_key, policy_key, noise_key, penalty_key = jax.random.split(key, 4)
+    states = _STATES[sac.policy_states]
+    acting = jax.tree.map(lambda x: jnp.concatenate([x] * states), label)
+    return Draw(
+        contexts=(
+            method.context(critic_key, memory, "critic", label),
+            method.context(policy_key, memory, "policy", acting),
+        ),
+        noise=jax.random.normal(noise_key, (1 + states, *size)),
+        penalty=penalty_key,
+    )
+
+
+def _critic_loss(critic, learner, batch, draw, method, sac):
+    context = draw.contexts[0]
+    mean, log_std = method.distribution(
+        learner.params, learner.memory, context, batch.next_observation
+    )
+    action, log_density = networks.sample_action(draw.noise[0], mean, log_std)
+    following = method.critic_input(context, batch.next_observation)
+    q_next = jnp.min(q_values(learner.target, following, action), axis=0)
+    if sac.critic_entropy == "batch_mean":
+        log_density = jnp.mean(log_density)
+    soft_value = q_next - jnp.exp(learner.log_temperature) * log_density
+    ended = batch.terminal
+    if sac.time_limit == "terminal":
+        ended = ended | batch.truncated
+    target = sac.reward_scale * batch.reward
+    target += sac.discount * jnp.where(ended, 0.0, soft_value)
+    # The action that was taken is valued by what was stored with it.
+    inputs = method.critic_input(batch.label, batch.observation)
+    q = q_values(critic, inputs, batch.action)
+    error = q - jax.lax.stop_gradient(target)
+    return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
+
+
+def _policy_loss(params, learner, batch, draw, method, sac):
+    memory, context = learner.memory, draw.contexts[1]
+    observation = batch.observation
+    if sac.policy_states == "both":
+        observation = jnp.concatenate([observation, batch.next_observation])
+    noise = draw.noise[1:].reshape(-1, draw.noise.shape[-1])
+    gaussian = method.distribution(params, memory, context, observation)
+    action, log_density = networks.sample_action(noise, *gaussian)
+    inputs = method.critic_input(context, observation)
+    q = jnp.min(q_values(learner.critic, inputs, action), axis=0)
+    entropy = -jnp.mean(log_density)
+    loss = -jnp.exp(learner.log_temperature) * entropy - jnp.mean(q)
+    penalty, metrics = method.penalty(
+        draw.penalty, params, memory, context, observation, gaussian
+    )
+    return loss + penalty, {"policy_loss": loss, "entropy": entropy} | metrics
+
+
+def _step(gradient, state, value, rate):
+    update, state = _ADAM.update(gradient, state, value)
+    return jax.tree.map(lambda u: -rate * u, update), state
+
+
+class _Actor(NamedTuple):
+    """What an update of the policy changes."""
+
+    params: Params
+    log_temperature: jax.Array
+    optimizers: tuple[Any, Any]
+
+
+def _update_policy(actor, learner, batch, draw, method, sac):
+    gradient, metrics = jax.grad(_policy_loss, has_aux=True)(
+        actor.params, learner, batch, draw, method, sac
+    )
+    policy_state, temperature_state = actor.optimizers
+    updates, policy_state = _step(gradient, policy_state, actor.params, sac.lr_policy)
+    updates = method.adjust_updates(updates, learner.memory)
+    actions = batch.action.shape[-1]
+    surplus = metrics["entropy"] + sac.target_multiplier * actions
+    # d/d log_temperature of temperature * (entropy - target entropy)
+    temperature = jnp.exp(actor.log_temperature)
+    step, temperature_state = _step(
+        temperature * surplus,
+        temperature_state,
+        actor.log_temperature,
+        sac.lr_temperature,
+    )
+    return _Actor(
+        params=optax.apply_updates(actor.params, updates),
+        log_temperature=actor.log_temperature + step,
+        optimizers=(policy_state, temperature_state),
+    ), metrics | {"temperature": temperature}
+
+
+def _actor(learner: Learner) -> _Actor:
+    policy_state, _, temperature_state = learner.optimizers
+    return _Actor(
+        learner.params, learner.log_temperature, (policy_state, temperature_state)
+    )
+
+
+def no_metrics(update: Callable[..., tuple[Any, Metrics]], *arguments: Any) -> Metrics:
+    """Zeros in the shape of the metrics that updates give beside what they change."""
+    _, shapes = jax.eval_shape(update, *arguments)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def first_metrics(
+    learner: Learner, batch: Batch, draw: Draw, method: Method, sac: SacSettings
+) -> Metrics:
+    """What `update` is given before there was one; zeros."""
+    policy = no_metrics(
+        lambda: _update_policy(_actor(learner), learner, batch, draw, method, sac)
+    )
+    return {"critic_loss": jnp.zeros(()), "q": jnp.zeros(()), **policy}
+
+
+def _every(delay, count, change, keep, value):
+    """What becomes of a value that only every so many-th update changes."""
+    if delay == 1:  # a branch would copy
+        return change(value)
+    return jax.lax.cond(count % delay == 0, change, keep, value)
+
+
+def update(
+    learner: Learner,
+    metrics: Metrics,
+    batch: Batch,
+    draw: Draw,
+    count: jax.Array,
+    method: Method,
+    sac: SacSettings,
+) -> tuple[Learner, Metrics]:
+    """One update of the critics and, in its turn, of policy and targets.
+
+    Args:
+      learner: the member's learner.
+      metrics: of the previous update, kept where this one makes none.
+      batch: `[batch, ...]` transitions.
+      draw: what is left to chance.
+      count: `[]` int, updates made before in this task; it must be shared by all
+        members of a population, so that the delayed updates stay real branches.
+      method: the method.
+      sac: SAC's settings.
+    """
+    (loss, q), gradient = jax.value_and_grad(_critic_loss, has_aux=True)(
+        learner.critic, learner, batch, draw, method, sac
+    )
+    _, critic_state, _ = learner.optimizers
+    step, critic_state = _step(gradient, critic_state, learner.critic, sac.lr_critic)
+    critic = optax.apply_updates(learner.critic, step)
+    learner = learner._replace(critic=critic)
+    # Only what a branch changes goes through it: the rest would be copied.
+    actor, policy = _every(
+        sac.policy_delay,
+        count,
+        lambda actor: _update_policy(actor, learner, batch, draw, method, sac),
+        lambda actor: (
+            actor,
+            {k: v for k, v in metrics.items() if k not in ("critic_loss", "q")},
+        ),
+        _actor(learner),
+    )
+    target = _every(
+        sac.target_delay,
+        count,
+        lambda target: optax.incremental_update(critic, target, sac.target_rate),
+        lambda target: target,
+        learner.target,
+    )
+    policy_state, temperature_state = actor.optimizers
+    return learner._replace(
+        params=actor.params,
+        log_temperature=actor.log_temperature,
+        target=target,
+        optimizers=(policy_state, critic_state, temperature_state),
+    ), policy | {"critic_loss": loss, "q": q}
+
+
+def updates(
+    learner: Learner,
+    draws: Draw,
+    batch: Callable[[jax.Array], Batch],
+    first: jax.Array | int,
+    count: jax.Array | int,
+    method: Method,
+    sac: SacSettings,
+) -> tuple[Learner, Metrics]:
+    """Updates one after the other, and the last one's metrics.
+
+    Args:
+      learner: the member's learner.
+      draws: `[count]` or more on every leaf.
+      batch: gives the transitions of the update with a number `[]` int.
+      first: `[]` int, updates made before in this task, see `update`.
+      count: `[]` int, how many to make.
+      method: the method.
+      sac: SAC's settings.
+    """
+
+    def one(number, carry):
+        learner, metrics = carry
+        draw, made = jax.tree.map(lambda x: x[number], draws), first + number
+        return update(learner, metrics, batch(number), draw, made, method, sac)
+
+    draw = jax.tree.map(lambda x: x[0], draws)
+    metrics = first_metrics(learner, batch(jnp.asarray(0)), draw, method, sac)
+    return jax.lax.fori_loop(0, count, one, (learner, metrics))

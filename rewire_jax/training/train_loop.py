@@ -1,0 +1,361 @@
+"""One task's compiled loop: collect, store, update, for a whole population."""
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.core.settings import SacSettings
+from rewire_jax.envs.base import Environment, HostEnvironment, Task
+from rewire_jax.methods.base import Method
+from rewire_jax.training import exploration, replay_buffer, rollout, sac
+
+
+class Shape(NamedTuple):
+    """Static sizes of the loop.
+
+    Attributes:
+      envs: parallel environments of a member.
+      updates: SAC updates at a time.
+      warmup: steps of all environments before the first update.
+      random: steps of all environments with uniform actions.
+      transitions: steps of all environments that the buffer holds.
+      every: steps of all environments from one time to the next.
+      overlap: whether environments on the host are stepped while updates are made, by
+        the policy before these updates.
+    """
+
+    envs: int
+    updates: int
+    warmup: int
+    random: int
+    transitions: int
+    every: int = 1
+    overlap: bool = False
+
+    def due(self, steps: Any) -> Any:
+        """Whether there are updates after so many steps, an int or `[]`."""
+        return (steps % self.every == 0) & (steps > self.warmup)
+
+    def before(self, steps: Any) -> Any:
+        """Updates made before those that are due after so many steps."""
+        return (steps // self.every - 1 - self.warmup // self.every) * self.updates
+
+
+class Collection(NamedTuple):
+    """What collecting changes within a task.
+
+    Attributes:
+      buffer: the replay buffer.
+      episodes: `[envs]` environments.
+      label: the method's, of the latest step.
+    """
+
+    buffer: replay_buffer.Replay
+    episodes: rollout.Episode
+    label: Any
+
+
+class State(NamedTuple):
+    """A member in the middle of a task.
+
+    Attributes:
+      learner: all that learning changes.
+      collection: all that collecting changes.
+      alive: `[]` bool; once a value is not finite the learner is updated no more.
+      acting: parameters and memory that act next, with `Shape.overlap`; else `()`.
+    """
+
+    learner: sac.Learner
+    collection: Collection
+    alive: jax.Array
+    acting: Any = ()
+
+
+class Report(NamedTuple):
+    """What happened in a chunk.
+
+    Attributes:
+      episodes: `[]`, training episodes that ended.
+      returns: `[]`, the sum of their returns.
+      rewards: `[]`, the sum over steps of the mean reward of all environments.
+      updates: `[]`, steps with updates.
+      metrics: sums over these steps, of each one's last update.
+      inspected: the method's own metrics at the end.
+      successes: `rollout.Success` of `[]`, episodes among them that were solved; `()`
+        where none is known.
+    """
+
+    episodes: jax.Array
+    returns: jax.Array
+    rewards: jax.Array
+    updates: jax.Array
+    metrics: sac.Metrics
+    inspected: sac.Metrics
+    successes: Any = ()
+
+
+def select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """`yes` where the scalar condition holds, else `no`, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def all_finite(tree: Any) -> jax.Array:
+    """`[]` bool, no leaf holds a NaN or an infinity."""
+    # A sum is not finite as soon as one term is not.
+    total = sum(jnp.sum(jnp.abs(leaf) * 1e-6) for leaf in jax.tree.leaves(tree))
+    return jnp.isfinite(total)
+
+
+def collect(
+    key: jax.Array,
+    state: State,
+    task: Task,
+    time: jax.Array,
+    environment: Environment,
+    method: Method,
+    shape: Shape,
+    sequence: jax.Array | None,
+) -> tuple[Collection, rollout.Step]:
+    """One exploring step of all environments of a member, stored in its buffer."""
+    learner, (buffer, episodes, label), *_ = state
+    size = shape.envs, environment.action_size
+    action, label = exploration.explore(
+        exploration.draw(key, time, size, shape.random, sequence),
+        (learner.params, learner.memory),
+        label,
+        episodes.state.observation,
+        episodes.steps,
+        method,
+    )
+    length = environment.episode_length
+    if environment.varied:
+        # All episodes end together, and so are reset in a real branch.
+        keys = jax.random.split(jax.random.split(key, 5)[4], shape.envs)
+        starts = jax.lax.cond(
+            (time + 1) % length == 0,
+            lambda: jax.vmap(lambda k: environment.reset(task, k))(keys),
+            lambda: episodes.start,
+        )
+        episodes = episodes._replace(start=starts)
+    advance = functools.partial(rollout.advance, environment, task)
+    episodes, step = jax.vmap(advance)(episodes, action)
+    buffer = store(buffer, time, action, label, step, length)
+    return Collection(buffer, episodes, label), step
+
+
+def store(
+    buffer: replay_buffer.Replay,
+    time: jax.Array,
+    action: jax.Array,
+    label: Any,
+    step: rollout.Step,
+    episode_length: int,
+) -> replay_buffer.Replay:
+    """A member's buffer with one more step of all environments."""
+    return replay_buffer.add(
+        buffer,
+        time,
+        action=action,
+        reward=step.reward,
+        terminal=step.terminal,
+        truncated=step.truncated,
+        last=step.last,
+        following=step.following,
+        episode_length=episode_length,
+        label=label,
+    )
+
+
+def learn(
+    key: jax.Array,
+    state: State,
+    time: jax.Array,
+    first: jax.Array,
+    due: jax.Array | bool,
+    *,
+    updates: int,
+    environment: Environment | HostEnvironment,
+    method: Method,
+    settings: SacSettings,
+) -> tuple[State, sac.Metrics]:
+    """Updates from a member's buffer, and the last one's metrics.
+
+    All that they leave to chance is drawn before the first: many small draws would
+    take more time than one large one.
+
+    Args:
+      key: a random key.
+      state: the member.
+      time: `[]` int, steps of all environments in the buffer.
+      first: `[]` int, updates made before; shared by all members.
+      due: `[]` bool, whether there are any; shared by all members.
+      updates: how many.
+      environment: unbatched.
+      method: the method.
+      settings: SAC's.
+    """
+    buffer, length = state.collection.buffer, environment.episode_length
+    size = settings.batch_size, environment.action_size
+
+    def learned(learner):
+        places_key, draw_key = jax.random.split(key)
+        places = replay_buffer.draw(buffer, places_key, time, (updates, size[0]))
+        draws = jax.vmap(
+            lambda key, label: sac.draw(
+                key, learner.memory, label, size, method, settings
+            )
+        )(
+            jax.random.split(draw_key, updates),
+            replay_buffer.labels(buffer, places, time),
+        )
+
+        def batch(number):
+            return replay_buffer.take(buffer, places[number], time, length)
+
+        return sac.updates(learner, draws, batch, first, updates, method, settings)
+
+    # A loop of one turn or none, which stays one under the population.
+    learner, metrics = jax.lax.fori_loop(
+        0,
+        jnp.asarray(due, jnp.int32),
+        lambda _, carry: learned(carry[0]),
+        (state.learner, sac.no_metrics(learned, state.learner)),
+    )
+    alive = state.alive & all_finite(
+        (learner.params, learner.critic, learner.log_temperature)
+    )
+    learner = select(alive, learner, state.learner)
+    return state._replace(learner=learner, alive=alive), metrics
+
+
+def follow(
+    key: jax.Array,
+    state: State,
+    steps: jax.Array,
+    *,
+    environment: Environment | HostEnvironment,
+    method: Method,
+    settings: SacSettings,
+    shape: Shape,
+) -> tuple[State, sac.Metrics]:
+    """The updates that are due after so many steps of a task, as in `learn`."""
+    return learn(
+        key,
+        state,
+        steps,
+        shape.before(steps),
+        shape.due(steps),
+        updates=shape.updates,
+        environment=environment,
+        method=method,
+        settings=settings,
+    )
+
+
+def train(
+    key: jax.Array,
+    state: State,
+    task: Task,
+    time: jax.Array,
+    steps: jax.Array,
+    *,
+    environment: Environment,
+    method: Method,
+    settings: SacSettings,
+    shape: Shape,
+) -> tuple[State, Report]:
+    """Collects and learns for some steps; one member.
+
+    Args:
+      key: the task's key; a step's randomness follows from it and the time alone.
+      state: the member.
+      task: the current task.
+      time: `[]` int, steps of all environments made before in this task. It and
+        `steps` must be shared by all members.
+      steps: `[]` int, steps to make.
+      environment: unbatched.
+      method: the method.
+      settings: SAC's.
+      shape: static sizes.
+    """
+    color, length = settings.noise_color, environment.episode_length
+    size = shape.envs, environment.action_size
+
+    def update(key, state, done):
+        return follow(
+            key,
+            state,
+            done,
+            environment=environment,
+            method=method,
+            settings=settings,
+            shape=shape,
+        )
+
+    def step(index, carry):
+        state, report, sequence = carry
+        if sequence is not None:
+            # It is not part of the state: a chunk draws it anew.
+            sequence = jax.lax.cond(
+                (index % length == 0) | (index == time),
+                lambda: exploration.draw_sequence(key, index, size, length, settings),
+                lambda: sequence,
+            )
+        collect_key, update_key = jax.random.split(jax.random.fold_in(key, index))
+        collection, stepped = collect(
+            collect_key, state, task, index, environment, method, shape, sequence
+        )
+        state = state._replace(collection=collection)
+        state, metrics = update(update_key, state, index + 1)
+        ended = stepped.terminal | stepped.truncated
+        report = Report(
+            report.episodes + jnp.sum(ended),
+            report.returns + jnp.sum(jnp.where(ended, stepped.score, 0.0)),
+            report.rewards + jnp.mean(stepped.reward),
+            report.updates + shape.due(index + 1),
+            jax.tree.map(jnp.add, report.metrics, metrics),
+            {},
+            jax.tree.map(
+                lambda total, solved: total + jnp.sum(ended & solved),
+                report.successes,
+                stepped.success,
+            ),
+        )
+        return state, report, sequence
+
+    none = jnp.zeros(())
+    report = Report(
+        jnp.zeros((), jnp.int32),
+        none,
+        none,
+        none,
+        sac.no_metrics(update, key, state, time),
+        {},
+        rollout.Success(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+        if environment.success
+        else (),
+    )
+    end = time + steps
+    sequence = jnp.zeros((length, *size)) if color else None
+    carry = state, report, sequence
+    state, report, _ = jax.lax.fori_loop(time, end, step, carry)
+    inspected = inspect(key, state, end, length, method, settings)
+    return state, report._replace(inspected=inspected)
+
+
+def inspect(
+    key: jax.Array,
+    state: State,
+    time: jax.Array,
+    length: int,
+    method: Method,
+    settings: SacSettings,
+) -> sac.Metrics:
+    """The method's own metrics after `time` steps; key and length as above."""
+    # A key that the next step does not use.
+    batch_key = jax.random.split(jax.random.fold_in(key, time), 3)[2]
+    buffer, learner = state.collection.buffer, state.learner
+    batch = replay_buffer.sample(buffer, batch_key, time, settings.batch_size, length)
+    return method.inspect(learner.params, learner.memory, batch.observation)

@@ -1,0 +1,260 @@
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+from fake_run import TRIPLET, write_alone, write_cw
+
+from rewire_jax.cli import main
+from rewire_jax.storage import checkpoint
+from rewire_jax.storage.run_folder import HEADER
+
+TINY = {
+    "--method": "ft1",
+    "--profile": "quick",
+    "--tasks": 1,
+    "--interactions": 320,
+    "--envs": 16,
+    "--updates": 1,
+    "--warmup": 160,
+    "--eval-episodes": 2,
+    "--report-every": 160,
+    "--checkpoint-every": 0,
+    "--hidden": 8,
+    "--batch-size": 8,
+}
+TINY = [str(word) for pair in TINY.items() for word in pair]
+
+
+def fails(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        main.main([str(word) for word in words])
+    assert exit_.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    return error
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cli") / "run"
+    main.main(["train", "probe/reach", "--out", str(folder), *TINY])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ("halfcheetah/forgeting", "halfcheetah/forgetting"),
+        ("probe/reach --method rewired", "rewire"),
+        ("probe/reach --profile fast", "quick"),
+        ("ant/transfer --backend bullet", "positional"),
+        ("probe/reach --modes 0", "--modes"),
+        ("probe/reach --modes 3 --mode-slots 2", "--mode-slots"),
+        ("probe/reach --beta -1", "--beta"),
+        ("probe/reach --beta nan", "--beta"),
+        ("probe/reach --tau 0", "--tau"),
+        ("probe/reach --dropout 1", "--dropout"),
+        ("probe/reach --seeds 0", "--seeds"),
+        ("probe/reach --seed -1", "--seed"),
+        ("probe/reach --tasks 5", "--tasks"),
+        ("probe/reach --lr-policy 0", "--lr-policy"),
+        ("probe/reach --discount 1.5", "--discount"),
+        ("probe/reach --noise-color -1", "--noise-color"),
+        ("probe/reach --noise-color inf", "--noise-color"),
+        ("probe/reach --warmup 20000", "--warmup"),
+        ("probe/reach --envs 0", "--envs"),
+        ("probe/reach --seeds many", "many"),
+        ("probe/reach --sedes 3", "perhaps you meant --seeds"),
+        ("probe/reach --seeds 99999999999", "--seeds must be at most 4096"),
+        ("probe/reach --hidden 2000000000", "lower --seeds"),
+        ("probe/reach --scenario ant/transfer", "--scenario"),
+        ("probe/reach --backend mjx", "--backend"),
+        ("probe/reach --time-limit never", "never"),
+        ("", "scenario"),
+    ],
+)
+def test_bad_settings(
+    words: str, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert named in fails(capsys, "train", *words.split(), "--out", str(out))
+    assert not out.exists()
+
+
+def test_no_out(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--out" in fails(capsys, "train", "probe/reach")
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "evaluate" in fails(capsys, "play")
+
+
+def test_folders_that_do_not_fit(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    train = ["train", "probe/reach", *TINY, "--out"]
+    assert "another run" in fails(capsys, *train, run)
+    (tmp_path / "foreign").mkdir()
+    (tmp_path / "foreign" / "thesis.tex").touch()
+    assert "something else" in fails(capsys, *train, tmp_path / "foreign")
+    assert "holds no run" in fails(capsys, *train, tmp_path / "none", "--resume")
+    changed = fails(capsys, *train, run, "--resume", "--discount", "0.9")
+    assert "--discount was 0.99, not 0.9" in changed
+    assert "holds no run" in fails(capsys, "evaluate", tmp_path / "none")
+    assert "task 3" in fails(capsys, "evaluate", run, "--stage", "3")
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_a_damaged_run(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    newest = checkpoint.available(copy / "checkpoints")[0]
+    for file in newest.rglob("*"):
+        if file.is_file() and file.parent != newest:
+            file.write_bytes(file.read_bytes()[:-1])
+    assert newest.name in fails(capsys, "evaluate", copy)
+    (copy / HEADER).write_text("{")
+    assert "damaged" in fails(capsys, "evaluate", copy)
+    (copy / HEADER).write_text('{"format": 0}')
+    assert "version" in fails(capsys, "evaluate", copy)
+
+
+def test_resuming_what_is_finished_changes_nothing(run: Path) -> None:
+    results = (run / "results.jsonl").read_bytes()
+    main.main(["train", "probe/reach", "--out", str(run), *TINY, "--resume"])
+    assert (run / "results.jsonl").read_bytes() == results
+
+
+def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main.main(["evaluate", str(run), "--episodes", "3", "--json"])
+    row = json.loads(capsys.readouterr().out)
+    assert row["steps"] == 3 * 20
+    main.main(["evaluate", str(run), "--episodes", "3"])
+    assert f"{row['return']:.1f}" in capsys.readouterr().out
+
+
+def test_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    out = tmp_path / "report"
+    main.main(["report", str(run), "--out", str(out)])
+    shown = capsys.readouterr().out
+    assert "Scores are raw returns" in shown
+    assert "FT-1" in shown
+    for name in ("report.md", "report.csv", "result.json", "tradeoff.png"):
+        assert (out / name).stat().st_size > 0
+        assert str(out / name) in shown
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_report_of_success_rates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_cw(tmp_path / "run")
+    single = [str(write_alone(tmp_path / t, t, [0, 0, 0])) for t in TRIPLET]
+    words = ["report", str(run), "--out", str(tmp_path / "out")]
+    main.main([*words, "--success", "last", "--single", *single])
+    shown = capsys.readouterr().out
+    # Half of (0.4 + 0.5 + 0.7) / 3 and of what the second seed solves above it.
+    assert "0.29 ± 0.04" in shown
+    assert "solved at their last step" in shown
+    assert "AUC_b" in shown
+    assert "no single-task run of" in fails(capsys, *words, "--single", single[0])
+    assert "--success" in fails(capsys, *words, "--success", "first")
+
+
+def test_reports_that_cannot_be(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "name the folder" in fails(capsys, "report")
+    assert "given twice" in fails(capsys, "report", run, run)
+    assert "not the folder of a run" in fails(capsys, "report", tmp_path)
+    assert "--oot" in fails(capsys, "report", run, "--oot", tmp_path)
+    (tmp_path / "file").touch()
+    assert "cannot write" in fails(capsys, "report", run, "--out", tmp_path / "file")
+
+
+def test_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
+    main.main(["list", "--json"])
+    names = json.loads(capsys.readouterr().out)
+    assert {"ant/transfer", "humanoid/hard"} <= set(names["scenarios"])
+    assert {"rewire", "ft1"} <= set(names["methods"])
+    main.main(["list"])
+    assert "halfcheetah/robustness" in capsys.readouterr().out
+    main.main(["info", "probe/reach", "--json"])
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["interactions"] == 10_000
+    assert [len(task["action_scale"]) for task in facts["tasks"]] == [2] * 4
+    assert facts["model_size"]["ft1"] == 1
+    assert 2 < facts["model_size"]["rewire"] < 2.2
+    main.main(["info", "probe/reach"])
+    assert "probe/reach" in capsys.readouterr().out
+
+
+def test_help_names_the_settings_and_their_values(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as exit_:
+        main.main(["train", "probe/reach", "--help"])
+    assert exit_.value.code == 0
+    shown = capsys.readouterr().out
+    for flag in ("--interactions", "--lr-policy", "--modes", "--beta", "--resume"):
+        assert flag in shown
+
+
+@pytest.mark.parametrize("command", main._COMMANDS)
+def test_what_is_unexpected_ends_in_a_line_too(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(arguments):
+        assert arguments == ["--some", "words"]
+        raise RuntimeError("a surprise\nof two lines")
+
+    monkeypatch.setitem(main._COMMANDS, command, broken)
+    for more in ([], ["--debug"]):
+        with pytest.raises(SystemExit) as exit_:
+            main.main([command, *more, "--some", "words"])
+        assert exit_.value.code == 1
+        *before, line = capsys.readouterr().err.splitlines()
+        assert line.startswith("error: unexpected RuntimeError: a surprise; run again")
+        assert bool(before) == bool(more)
+    assert any("in broken" in each for each in before)
+
+
+def test_too_little_memory_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def greedy(arguments):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setitem(main._COMMANDS, "list", greedy)
+    assert "lower --seeds, --envs" in fails(capsys, "list")
+
+
+def test_an_interruption_shows_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(main._COMMANDS, "list", interrupted)
+    with pytest.raises(SystemExit) as exit_:
+        main.main(["list"])
+    assert exit_.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_nothing_is_imported_upward() -> None:
+    # Every module of the package is loaded by now; none may wait for the command.
+    assert "rewire_jax.cli.main" in sys.modules
+    import rewire_jax
+
+    assert sorted(rewire_jax.__all__) == rewire_jax.__all__
+    assert all(hasattr(rewire_jax, name) for name in rewire_jax.__all__)

@@ -1,0 +1,142 @@
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rewire_jax
+from docs import drawings
+from rewire_jax.cli import main
+from rewire_jax.envs import scenarios
+from rewire_jax.methods import METHODS
+from tests.tiny import tiny
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The pages by name, built with warnings as errors, links between them checked."""
+    folder = tmp_path_factory.mktemp("docs")
+    words = ["--fail-on-warning", "--keep-going", "--quiet", "--fresh-env"]
+    out = folder / "site"
+    built = subprocess.run(
+        [sys.executable, "-m", "sphinx", *words, "-d", folder, ROOT / "docs", out],
+        capture_output=True,
+        text=True,
+        cwd=folder,
+    )
+    assert built.returncode == 0, built.stderr
+    return {path.stem: path.read_text() for path in out.glob("*.html")}
+
+
+def codes(page):
+    """What a page has as code, its tags taken away."""
+    found = re.findall(r"<code.*?>(.*?)</code>", page, re.S)
+    return {re.sub(r"<.*?>", "", code) for code in found}
+
+
+def flags(capsys, *arguments):
+    """The flags that a command's own help tells of."""
+    with pytest.raises(SystemExit):
+        main.main([*arguments, "--help"])
+    told = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", capsys.readouterr().out))
+    # A scenario goes by its place.
+    told -= {"--help", "--scenario"}
+    return {flag for flag in told if not flag.startswith("--no-")}
+
+
+def test_every_command_and_its_arguments_are_told(site, capsys) -> None:
+    page, known = site["commands"], codes(site["commands"]) | codes(site["settings"])
+    usage = flags(capsys)
+    assert usage >= {"--out", "--cache"}
+    for flag in usage - {"--SETTING"}:
+        assert flag in page
+    for command in main._COMMANDS:
+        assert any(code.startswith(f"rewire-jax {command}") for code in codes(page))
+        place = ["probe/reach"] if command in ("train", "sweep") else []
+        assert flags(capsys, command, *place) <= known
+
+
+def test_every_setting_of_every_method_is_told(site, capsys) -> None:
+    known = codes(site["settings"])
+    for method in METHODS:
+        assert method in known
+        own = flags(capsys, "train", "probe/reach", "--method", method)
+        own -= flags(capsys, "list")
+        assert len(own) > 30
+        assert own - {"--out", "--resume", "--log"} <= known
+
+
+def test_the_whole_public_face_is_told(site) -> None:
+    for name in rewire_jax.__all__:
+        assert f'id="rewire_jax.{name}"' in site["api"]
+    for name in ("base.Method", "base.Spec", "wiring.refine"):
+        assert f'id="rewire_jax.methods.{name}"' in site["api"]
+    assert 'id="rewire_jax.envs.base.Environment"' in site["api"]
+
+
+def test_committed_results_are_shown(site) -> None:
+    title = (ROOT / "experiments/results/model-sizes.md").read_text().splitlines()[0]
+    assert title.removeprefix("# ") in site["results"]
+    assert "made:" not in "".join(site.values())
+
+
+def test_nothing_is_fetched_to_read_it(site) -> None:
+    for page in site.values():
+        assert not re.findall(r"<(?:script|link|img)[^>]*=\"(?:https?:)?//", page)
+
+
+def test_drawings_are_the_same_each_time(tmp_path: Path) -> None:
+    first, second = (drawings.write(tmp_path / name) for name in "ab")
+    assert [path.stem for path in first] == ["permutation", "modes", "alignment"]
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_a_domain_of_ones_own_is_learned_and_its_files_are_told(
+    site, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(scenarios, "DOMAINS", scenarios.DOMAINS.copy())
+    monkeypatch.setattr(scenarios, "SCENARIOS", scenarios.SCENARIOS.copy())
+    from docs.examples import corridor
+
+    scenario = rewire_jax.make_scenario("corridor/ends")
+    task = scenario.tasks[2].data
+    state = scenario.environment.reset(task, jax.random.key(0))
+    moved = scenario.environment.step(task, state, jnp.ones(1))
+    expected = np.clip(state.inner - corridor.STRIDE, -1, 1)
+    np.testing.assert_allclose(moved.observation, expected, rtol=1e-6)
+    np.testing.assert_allclose(moved.reward, -abs(0.8 - expected[0]), rtol=1e-6)
+
+    settings = dataclasses.replace(tiny(scenario), tasks=1, seeds=1)
+    folder = rewire_jax.train(settings, tmp_path / "run", scenario=scenario)
+    known = codes(site["files"])
+    files = {path.name for path in folder.iterdir()}
+    assert {name.replace("checkpoints", "checkpoints/") for name in files} <= known
+    told = set(json.loads((folder / "settings.json").read_text()))
+    for table in folder.glob("*.jsonl"):
+        told |= set(json.loads(table.read_text().splitlines()[-1]))
+    assert {"alignment", "model_size", "compile"} <= told <= known
+
+
+@pytest.mark.slow
+def test_the_question_of_the_quick_start_is_answered(
+    tmp_path: Path, monkeypatch
+) -> None:
+    from docs.examples import limping
+
+    scale = rewire_jax.make_scenario(limping.SPEC).tasks[1].action_scale
+    assert sorted(scale) == [0, 0, 1, 1, 1, 1, 1, 1]
+    # The rest of it where nothing takes minutes.
+    monkeypatch.setattr(limping, "SPEC", "probe/reach")
+    small = {"tasks": 2, "interactions": 640, "warmup": 160, "eval_episodes": 4}
+    for _ in range(2):  # What is finished stays.
+        report = limping.compare(tmp_path, **small)
+    assert all(label in report.read_text() for label in ("rewire", "FT-1", "SAC-N"))

@@ -1,0 +1,138 @@
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from rewire_jax.nn import networks
+
+KEY = jax.random.key(0)
+
+
+def density(action, mean, std):
+    """Of tanh(N(mean, std)) at `action`, by the change of variables, in float64."""
+    action = np.asarray(action, np.float64)
+    return stats.norm.pdf(np.arctanh(action), mean, std) / (1 - action**2)
+
+
+def test_layers_are_uniform_within_torchs_bound():
+    sizes = [9, 200, 50]
+    layers = jax.jit(lambda key: networks.init_mlp(key, sizes))(KEY)
+    assert [layer.weight.shape for layer in layers] == [(200, 9), (50, 200)]
+    assert [layer.bias.shape for layer in layers] == [(200,), (50,)]
+    for layer, inputs in zip(layers, sizes, strict=False):
+        for values in layer:
+            scaled = np.ravel(values) * np.sqrt(inputs)
+            assert np.abs(scaled).max() <= 1 + 1e-6
+            assert stats.kstest(scaled, stats.uniform(-1, 2).cdf).pvalue > 1e-4
+    assert not np.any(np.isin(layers[0].weight, layers[0].bias))
+
+
+def test_mlp_is_affine_layers_with_leaky_relu_between():
+    random = np.random.default_rng(0)
+    sizes = [3, 7, 5, 2]
+    layers = [
+        networks.Linear(random.normal(size=pair[::-1]), random.normal(size=pair[1]))
+        for pair in itertools.pairwise(sizes)
+    ]
+    inputs = random.normal(size=(4, 6, 3))
+    x = inputs
+    for number, (weight, bias) in enumerate(layers):
+        x = x @ weight.T + bias
+        if number < 2:
+            x = np.where(x > 0, x, 0.2 * x)
+    np.testing.assert_allclose(
+        jax.jit(networks.mlp)(layers, inputs), x, rtol=1e-4, atol=1e-5
+    )
+
+
+def test_derivatives_are_those_of_plain_products():
+    # The layers have a derivative rule of their own, forwards and backwards.
+    layers = networks.init_mlp(jax.random.key(0), [3, 8, 8, 2])
+    x = jax.random.normal(jax.random.key(1), (5, 4, 3))
+
+    def plain(layers, x):
+        for weight, bias in layers[:-1]:
+            x = networks.activate(x @ weight.T + bias)
+        return x @ layers[-1].weight.T + layers[-1].bias
+
+    def derivatives(network):
+        def total(layers, x):
+            return jnp.sum(network(layers, x) ** 2)
+
+        directions = jax.tree.map(jnp.cos, (layers, x))
+        return (
+            jax.grad(total, (0, 1))(layers, x),
+            jax.jvp(network, (layers, x), directions)[1],
+            jax.hessian(total, 1)(layers, x[0, 0]),
+        )
+
+    jax.tree.map(
+        functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4),
+        derivatives(networks.mlp),
+        derivatives(plain),
+    )
+
+
+def test_the_policy_splits_and_clips_its_output():
+    output = jnp.asarray([[1.0, -30.0, 5.0, -25.0], [0.5, 0.2, -1.0, 2.5]])
+    mean, log_std = networks.gaussian(output)
+    np.testing.assert_array_equal(mean, output[:, :2])
+    np.testing.assert_allclose(log_std, [[2.0, -20.0], [-1.0, 2.0]])
+
+
+@pytest.mark.parametrize(
+    ("mean", "std"), [(0.0, 1.0), (0.4, 0.3), (-0.8, 0.1), (0.2, 2.0)]
+)
+def test_log_density_is_that_of_a_squashed_gaussian(mean, std):
+    # By a grid: the reference is a density. It has steep sides near ±1.
+    centres = np.tanh(np.linspace(mean - 9 * std, mean + 9 * std, 20_001))
+    inside = centres[np.abs(centres) < 1 - 1e-12]
+    mass = np.trapezoid(density(inside, mean, std), inside)
+    assert mass == pytest.approx(1, abs=1e-4)
+
+    arguments = jnp.full((20_000, 1), mean), jnp.full((20_000, 1), np.log(std))
+    action, log_density = jax.jit(networks.sample_action)(
+        jax.random.normal(KEY, arguments[0].shape), *arguments
+    )
+    action = np.asarray(action[:, 0], np.float64)
+    # Where float32 still tells the action from ±1.
+    safe = np.abs(action) < 0.99
+    assert safe.mean() > 0.3
+    expected = np.log(density(action[safe], mean, std))
+    np.testing.assert_allclose(log_density[safe], expected, rtol=2e-3, atol=2e-3)
+    # The samples have the density: raw values are normal.
+    raw = np.arctanh(action[safe])
+    edges = (np.arctanh(np.array([-0.99, 0.99])) - mean) / std
+    truncated = stats.truncnorm(*edges, loc=mean, scale=std)
+    assert stats.kstest(raw, truncated.cdf).pvalue > 1e-4
+
+
+def test_log_densities_add_up_over_actions():
+    random = np.random.default_rng(0)
+    mean = random.normal(size=(5, 4, 3)).astype(np.float32)
+    log_std = random.uniform(-1.5, -0.5, size=(5, 4, 3)).astype(np.float32)
+    action, log_density = jax.jit(networks.sample_action)(
+        random.normal(size=mean.shape).astype(np.float32), mean, log_std
+    )
+    assert action.shape == (5, 4, 3)
+    assert log_density.shape == (5, 4)
+    each = np.log(density(action, mean, np.exp(log_std)))
+    np.testing.assert_allclose(log_density, each.sum(-1), rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("mean", [-60.0, 60.0])
+def test_a_saturated_action_keeps_finite_density_and_gradients(mean):
+    @functools.partial(jax.value_and_grad, argnums=(0, 1))
+    def log_density(mean, log_std):
+        return networks.sample_action(jnp.full((1,), 0.1), mean, log_std)[1]
+
+    arguments = jnp.full((1,), mean), jnp.full((1,), networks.LOG_STD_MIN)
+    value, gradients = jax.jit(log_density)(*arguments)
+    # 1 / (1 - tanh²) grows as exp(2|mean|) / 4.
+    assert value == pytest.approx(20 + 2 * 60 - np.log(4) - 0.9189, abs=3)
+    assert gradients[0] == pytest.approx(2 * np.sign(mean), rel=1e-4)
+    assert np.isfinite(gradients[1]).all()

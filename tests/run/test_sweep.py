@@ -1,0 +1,556 @@
+import dataclasses
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rewire_jax
+from rewire_jax.cli import main
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import Settings
+from rewire_jax.methods import METHODS, Entry
+from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.regularization import FtL2Settings
+from rewire_jax.methods.rewire import RewireSettings, rewire
+from rewire_jax.nn import networks
+from rewire_jax.nn.networks import Linear
+from rewire_jax.nn.permutation import permute
+from rewire_jax.run import run_state, sweep, sweep_grid, train_run
+from rewire_jax.storage import run_folder
+from rewire_jax.training import run_setup
+from tests.tiny import flags, tiny
+
+GRID: dict[str, list[float]] = {
+    "modes": [1, 2, 3, 4],
+    "alpha": [0, 1e-2],
+    "beta": [0.1, 1, 10],
+}
+
+
+def small(**changes) -> Settings:
+    """Settings of a member; a width of its own, so that its traces are counted here."""
+    settings = dataclasses.replace(
+        tiny(),
+        seeds=1,
+        tasks=2,
+        interactions=320,
+        envs=8,
+        warmup=80,
+        report_every=80,
+        checkpoint_every=160,
+        eval_episodes=2,
+    )
+    sac = dataclasses.replace(settings.sac, hidden=14, batch_size=16)
+    return dataclasses.replace(settings, sac=sac, **changes)
+
+
+def command(out: Path, *more: str, most: int = 12) -> list[str]:
+    """A sweep of the grid from the command line, in two batches."""
+    words = [sys.executable, "-m", "rewire_jax.cli.main", "sweep", "probe/reach"]
+    words += [*flags(small()), "--out", str(out), "--members-per-batch", str(most)]
+    words += ["--k", *map(str, GRID["modes"]), "--alpha", *map(str, GRID["alpha"])]
+    return [*words, "--axis", "beta", *map(str, GRID["beta"]), *more]
+
+
+def run(words: list[str], **environment: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        words, capture_output=True, text=True, env=os.environ | environment, check=False
+    )
+
+
+def rows(folder: Path, table: str = "results.jsonl") -> dict[tuple, dict]:
+    """Rows of all batches by stage, member and the rest of their place."""
+    rest = "task" if table == "results.jsonl" else "interactions"
+    found = {}
+    for path in folder.glob(f"task-*/batch-*/{table}"):
+        for line in path.read_text().splitlines():
+            row = json.loads(line)
+            found[row["stage"], row["member"], row[rest]] = row
+    return found
+
+
+def near(ours: dict[tuple, dict], theirs: dict[tuple, dict]) -> None:
+    """The same rows, with numbers that differ as float sums in another order."""
+    assert ours.keys() == theirs.keys()
+    for place, row in ours.items():
+        assert row.keys() == theirs[place].keys()
+        for name, value in row.items():
+            other = theirs[place][name]
+            if isinstance(value, float):
+                other = pytest.approx(other, rel=2e-3, abs=2e-3)
+            assert value == other, (place, name)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sweeps") / "sweep"
+    done = run(command(folder))
+    assert done.returncode == 0, done.stderr
+    assert "24 configurations" in done.stdout
+    # Known before anything is compiled, and so said first.
+    first, *later = done.stderr.splitlines()
+    assert re.match(r"a member needs .* MB: learner .*; 24 members, 12 at a t", first)
+    assert all("finished in" in line for line in later)
+    for name in ("members.csv", "configurations.csv", "sweep.md", "panels.png"):
+        assert str(folder / name) in done.stdout
+        assert (folder / name).stat().st_size > 0
+    return folder
+
+
+def test_every_combination_is_a_member(swept: Path) -> None:
+    header = json.loads((swept / "settings.json").read_text())
+    values = [member["values"] for member in header["members"]]
+    assert values == sweep_grid.grid(GRID)
+    found = rows(swept)
+    assert set(found) == {
+        (stage, member, task)
+        for stage in (-1, 0, 1)
+        for member in range(24)
+        for task in range(2)
+    }
+    for stage in (0, 1):
+        batches = json.loads((swept / f"task-{stage:03d}/batches.json").read_text())
+        assert batches == {
+            "size": 12,
+            "batches": [list(range(12)), list(range(12, 24))],
+        }
+    # What is chosen by and what is reported are other episodes of the same policy.
+    same = sum(row["return"] == row["choice"] for row in found.values())
+    assert same < len(found) / 10
+
+
+def alone(numbers: range, swept: Path, tmp_path: Path) -> None:
+    """Compares members of the sweep with runs of their settings."""
+    together = rows(swept), rows(swept, "training.jsonl")
+    for number in numbers:
+        settings = sweep_grid.configure(small(), sweep_grid.grid(GRID)[number])
+        assert settings.options.mode_slots == settings.options.modes
+        folder = train_run.train(settings, tmp_path / str(number))
+        for theirs, table in zip(
+            together, ("results.jsonl", "training.jsonl"), strict=True
+        ):
+            lines = (folder / table).read_text().splitlines()
+            ours = {}
+            for row in map(json.loads, lines):
+                rest = row["task"] if "task" in row else row["interactions"]
+                ours[row["stage"], number, rest] = row | {"member": number}
+            wanted = {place: row for place, row in theirs.items() if place[1] == number}
+            # A run of its own has nothing to choose among.
+            wanted = {
+                place: {n: v for n, v in row.items() if n != "choice"}
+                for place, row in wanted.items()
+            }
+            near(ours, wanted)
+        observation = jnp.linspace(-1, 1, 20).reshape(10, 2)
+        for stage, task in ((0, 0), (None, 1)):
+            one = rewire_jax.load_policy(folder, task=task, stage=stage)
+            among = rewire_jax.load_policy(swept, task=task, stage=stage, member=number)
+            np.testing.assert_allclose(
+                one(observation), among(observation), rtol=1e-3, atol=1e-3
+            )
+
+
+def test_a_member_is_what_it_is_alone(swept: Path, tmp_path: Path) -> None:
+    alone(range(3, 24, 13), swept, tmp_path)
+
+
+@pytest.mark.slow
+def test_every_member_is_what_it_is_alone(swept: Path, tmp_path: Path) -> None:
+    alone(range(24), swept, tmp_path)
+
+
+def kept(folder: Path) -> list[np.ndarray]:
+    """All that is kept of all members at the end."""
+    first = json.loads((folder / "task-001/batches.json").read_text())
+    variants = [
+        sweep_grid.configure(small(), values) for values in sweep_grid.grid(GRID)
+    ]
+    settings, crowd = sweep._crowd(small(), sweep_grid.grid(GRID))
+    assert len(crowd) == len(variants)
+    leaves = []
+    for number, batch in enumerate(first["batches"]):
+        members = [crowd[n] for n in batch]
+        prepared = run_setup.prepare(settings, crowd=members, places=first["size"])
+        path = folder / f"task-001/batch-{number:03d}"
+        leaves += jax.tree.leaves(run_state.read_kept(path, 1, prepared))
+    return leaves
+
+
+def test_a_killed_sweep_resumes_bit_for_bit(swept: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    process = subprocess.Popen(command(folder), stderr=subprocess.PIPE)
+    table = folder / "task-001/batch-000/training.jsonl"
+    while process.poll() is None:
+        # In the middle of the second task, past its checkpoint, in the first batch.
+        if table.exists() and len(table.read_text().splitlines()) >= 3 * 12:
+            process.send_signal(signal.SIGKILL)
+            break
+        time.sleep(0.002)
+    assert process.wait() == -signal.SIGKILL
+    assert not run_state.finished(folder / "task-001/batch-000", 1)
+    done = run(command(folder, "--resume"))
+    assert done.returncode == 0, done.stderr
+    for path in swept.glob("task-*/batch-*/*.jsonl"):
+        if path.name != "timing.jsonl":
+            again = folder / path.relative_to(swept)
+            assert again.read_bytes() == path.read_bytes()
+    for ours, theirs in zip(kept(folder), kept(swept), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+COLLECTIVE = re.compile(r"all-reduce|all-gather|all-to-all|collective-permute")
+DEVICES = """
+import json, sys
+import jax, jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
+from rewire_jax.run import sweep, sweep_grid
+from rewire_jax.training import run_setup
+from tests.run.test_sweep import GRID, small
+
+settings, crowd = sweep._crowd(small(), sweep_grid.grid(GRID))
+made = run_setup.prepare(settings, crowd=crowd)
+learner = made.program.init(made.members)
+task = jax.tree.map(lambda leaf: leaf[0], made.tasks)
+alive = jnp.ones(24, bool)
+state = made.program.begin(made.members, learner, alive, 0, task)
+chunk = made.program.chunk.lower(made.members, state, 0, task, 0, 20)
+whole = jax.shard_map(
+    lambda x: jax.lax.psum(x, "members"), mesh=made.mesh, in_specs=P("members"),
+    out_specs=P(),
+)
+print(json.dumps({
+    "devices": [str(s.data.shape[0]) for s in state.alive.addressable_shards],
+    "chunk": chunk.compile().as_text(),
+    "control": jax.jit(whole).lower(jnp.ones(24)).compile().as_text(),
+}))
+"""
+EIGHT = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+
+
+def test_devices_train_their_members_without_a_word_to_each_other(
+    swept: Path, tmp_path: Path
+) -> None:
+    done = run(command(tmp_path / "sweep", most=24), XLA_FLAGS=EIGHT)
+    assert done.returncode == 0, done.stderr
+    near(rows(tmp_path / "sweep"), rows(swept))
+    compiled = run([sys.executable, "-c", DEVICES], XLA_FLAGS=EIGHT)
+    assert compiled.returncode == 0, compiled.stderr
+    found = json.loads(compiled.stdout)
+    assert found["devices"] == ["3"] * 8
+    assert not COLLECTIVE.search(found["chunk"])
+    # The search does find one where there is one.
+    assert COLLECTIVE.search(found["control"])
+
+
+def test_two_processes_share_the_batches(swept: Path, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    folder = tmp_path / "sweep"
+    shared = ["--coordinator", address, "--processes", "2"]
+    processes = [
+        subprocess.Popen(
+            command(folder, *shared, "--process", number),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for number in ("0", "1")
+    ]
+    said = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], said
+    # Each of them trained a batch of each task, and the first reports.
+    for number, (out, error) in enumerate(said):
+        assert error.count(f"batch {number + 1} of 2") == 2
+        assert error.count("finished in") == 2
+        assert ("sweep.md" in out) == (number == 0)
+    near(rows(folder), rows(swept))
+
+
+def run_sweep(folder: Path, settings: Settings, **options) -> Path:
+    return sweep.sweep(settings, folder, **options)
+
+
+def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
+    # Seven members in places for eight.
+    sac = dataclasses.replace(small().sac, hidden=15)
+    settings = dataclasses.replace(small(), sac=sac)
+    axis = {"beta": [1, 2, 3, 4, 5, 6, 7]}
+    folder = run_sweep(tmp_path / "s", settings, axes=axis, members_per_batch=4)
+    shared, crowd = sweep._crowd(settings, sweep_grid.grid(axis))
+    program = run_setup.prepare(shared, crowd=crowd[:4])[-1]
+    traces = {
+        name: function._cache_size()
+        for name, function in program._asdict().items()
+        if hasattr(function, "_cache_size") and name not in ("consolidate", "polish")
+    }
+    assert traces == dict.fromkeys(traces, 1)
+    assert "chunk" in traces
+    assert {place[1] for place in rows(folder)} == set(range(7))
+
+
+def test_halving_keeps_the_best_configurations(tmp_path: Path) -> None:
+    # Learning rates far apart, so that there is a better and a worse.
+    settings = small(seeds=2, tasks=3, interactions=480)
+    axis = {"lr_policy": [1e-5, 3e-3, 1e-4, 1e-3, 1e30]}
+    options = {"axes": axis, "members_per_batch": 4}
+    whole = rows(run_sweep(tmp_path / "whole", settings, **options))
+    halved = rows(run_sweep(tmp_path / "halved", settings, **options, halving=2))
+    chosen = [range(10)]
+    for stage in (0, 1):
+        scores = {}
+        for configuration in {member // 2 for member in chosen[-1]}:
+            seeds = [2 * configuration, 2 * configuration + 1]
+            mine = [whole[stage, m, t] for m in seeds for t in range(stage + 1)]
+            bad = sum(whole[stage, m, 0]["diverged"] for m in seeds)
+            mean = -np.inf if bad == 2 else np.mean([row["choice"] for row in mine])
+            scores[configuration] = (-bad, mean)
+        best = sorted(scores, key=scores.__getitem__, reverse=True)
+        best = best[: -(-len(best) // 2)]
+        chosen.append([m for c in sorted(best) for m in (2 * c, 2 * c + 1)])
+    assert [len(members) for members in chosen] == [10, 6, 4]
+    for stage, members in enumerate(chosen):
+        assert {place[1] for place in halved if place[0] == stage} == set(members)
+    # The absurd one diverged, is marked, and is not among the best.
+    assert whole[2, 8, 0]["diverged"]
+    assert halved[0, 9, 0]["diverged"]
+    assert 8 not in chosen[1]
+    # Those that are left go on as if the others were there.
+    near(halved, {place: whole[place] for place in halved})
+
+
+def test_settings_that_make_no_sense_are_said(tmp_path: Path) -> None:
+    for options, said in (
+        ({}, "needs an axis"),
+        ({"axes": {"beta": [1]}, "halving": 0}, "--halving"),
+        ({"axes": {"beta": [1]}, "random": -1}, "--random"),
+        ({"axes": {"beta": [1]}, "members_per_batch": -1}, "--members-per-batch"),
+        ({"axes": {"beta": [1]}, "random": 2}, "1 of the configurations are the same"),
+        ({"configurations": [{"beta": 1}, {"alpha": 1}]}, "the same settings"),
+        ({"axes": {"hidden": [1]}}, "no sweep over 'hidden'"),
+        ({"axes": {"beta": np.array([1, 1])}}, "1 of the configurations are the same"),
+    ):
+        with pytest.raises(UserError, match=said):
+            run_sweep(tmp_path / "none", small(), **options)
+    assert not (tmp_path / "none").exists()
+
+
+def fails(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command ends with 2 and one line that says what is wrong."""
+    with pytest.raises(SystemExit) as stopped:
+        main.main(words)
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 1
+
+
+def test_another_sweep_or_a_run_is_not_resumed(
+    swept: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for more, said in (
+        ([], "holds another run"),
+        (["--resume", "--halving", "2"], "other axes, seeds or halving"),
+        (["--resume", "--seeds", "2"], "other settings: --seeds"),
+        (["--resume", "--axis", "tau", "1", "2"], "other axes"),
+    ):
+        fails([*command(swept)[3:], *more], said, capsys)
+    for wrong, said in (
+        ({"task": 0}, "give member"),
+        ({"task": 0, "member": 24}, "no member 24"),
+        ({"task": 2, "member": 0}, "tasks 0 to 1"),
+        ({"task": 0, "member": 0, "stage": 2}, "not been trained on task 2"),
+    ):
+        with pytest.raises(UserError, match=said):
+            rewire_jax.load_policy(swept, **wrong)
+    with pytest.raises(UserError, match=r"holds a sweep, .* load_policy"):
+        rewire_jax.load_policies(swept)
+    with pytest.raises(UserError, match=r"holds a sweep: .* load_policy"):
+        rewire_jax.evaluate(swept)
+
+
+def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    (tmp_path / "sweep").touch()
+    with pytest.raises(UserError, match=r"cannot write to .*task-000: Not a directory"):
+        run_folder.make(tmp_path / "sweep" / "task-000")
+
+
+def test_report_takes_a_sweep(swept: Path, tmp_path: Path) -> None:
+    main.main(["report", str(swept), "--out", str(tmp_path)])
+    for name in ("members.csv", "configurations.csv", "panels.png"):
+        assert (tmp_path / name).read_bytes() == (swept / name).read_bytes()
+
+
+def test_random_and_halved_from_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # K is kept; of four configurations two and one go on.
+    words = command(tmp_path / "sweep")[3:]
+    words = [*words[: words.index("--k")], "--k", "1", "--beta", "0.1", "10"]
+    main.main([*words, "--random", "4", "--halving", "2"])
+    assert "4 configurations" in capsys.readouterr().out
+    header = json.loads((tmp_path / "sweep/settings.json").read_text())
+    values = [member["values"] for member in header["members"]]
+    assert {value["modes"] for value in values} == {1}
+    assert len({value["beta"] for value in values}) == 4
+    found = rows(tmp_path / "sweep")
+    assert len({place[1] for place in found if place[0] == 0}) == 4
+    assert len({place[1] for place in found if place[0] == 1}) == 2
+
+
+@pytest.mark.parametrize("name", ["chunk", "evaluate"])
+def test_a_sweep_stops_when_asked_to(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called = getattr(train_run.Run, name)
+
+    def interrupted(self, *rest):
+        os.kill(os.getpid(), signal.SIGINT)
+        return called(self, *rest)
+
+    options = {"axes": {"beta": [1, 2, 3, 4, 5, 6, 7]}, "members_per_batch": 4}
+    settings = dataclasses.replace(
+        small(), sac=dataclasses.replace(small().sac, hidden=15)
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(train_run.Run, name, interrupted)
+        with pytest.raises(train_run.Stopped, match="same command with --resume"):
+            run_sweep(tmp_path / "sweep", settings, **options)
+    assert not (tmp_path / "sweep/task-000/batch-001").exists()
+    run_sweep(tmp_path / "sweep", settings, **options, resume=True)
+    assert len(rows(tmp_path / "sweep")) == 3 * 7 * 2
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--axis", "beta"], "an axis needs a name and values"),
+        (["--axis", "beta", "1", "--beta", "2"], "beta is an axis twice"),
+        (["--axis", "beta", "one"], "could not convert"),
+        (["--k", "1.5"], "--modes must be a whole number"),
+        (["--k", "inf"], "--modes must be finite"),
+        (["--random", "2", "--beta", "1", "nan"], "--beta must be finite"),
+        (["--random", "2", "--k", "1.5", "4"], "--modes must be a whole number"),
+        (["--beta", "1", "--beta", "2"], "beta is an axis twice"),
+        (["--beta", "1", "--process", "1"], "need --coordinator"),
+        (["--beta", "1", "--processes", "two"], "are whole numbers"),
+        (["--axis", "tau", "0"], "--tau must be above 0"),
+        (["--random", "3", "--beta", "1", "2", "3"], "needs a range"),
+        (["--method", "ft1", "--alpha", "1"], "no sweep over 'alpha'"),
+        (["--beta", "1", "--coordinator", "nowhere"], "--coordinator nowhere"),
+        (["--beta", "1", "--resume"], "holds no sweep"),
+    ],
+)
+def test_wrong_arguments_end_in_one_line(
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = str(tmp_path / "sweep")
+    fails(["sweep", "probe/reach", *words, "--out", out], said, capsys)
+    assert not (tmp_path / "sweep").exists()
+
+
+class Permuted(NamedTuple):
+    """A plain policy whose hidden layers' outputs are permuted."""
+
+    hidden: tuple
+    head: Linear
+    scores: jax.Array
+
+
+def permuted_l2(spec: Spec, options: FtL2Settings) -> Method:
+    """FT-L2 with a learned permutation; of rewire it has the initial weights alone."""
+    start = rewire(spec, RewireSettings(mode_slots=1, head_slots=spec.tasks))
+
+    def init(key):
+        params, _ = start.init(key)
+        head = jax.tree.map(lambda leaf: leaf[0], params.heads)
+        scores = jnp.tile(jnp.linspace(0, 1, spec.hidden), (spec.depth, 1))
+        hidden = tuple(params.hidden)
+        return Permuted(hidden, head, scores), (jnp.asarray(False), hidden)
+
+    def start_task(key, params, memory, task):
+        del key, task
+        ranks = jnp.argsort(jnp.argsort(params.scores, axis=-1), axis=-1)
+        return params._replace(scores=ranks / (spec.hidden - 1)), memory
+
+    def distribution(params, memory, context, observation):
+        del memory, context
+        x = observation
+        for layer, scores in zip(params.hidden, params.scores, strict=True):
+            x = networks.activate(permute(networks.affine(layer, x), scores, 0.5))
+        return networks.gaussian(networks.affine(params.head, x))
+
+    def moved(params, memory):
+        trained, previous = memory
+        apart = jax.tree.map(
+            lambda a, b: jnp.sum((a - b) ** 2), params.hidden, previous
+        )
+        return jnp.where(trained, sum(jax.tree.leaves(apart)), 0.0)
+
+    def penalty(key, params, memory, context, observation, gaussian):
+        del key, context, observation, gaussian
+        return options.coefficient * moved(params, memory), {}
+
+    def policy(params, memory, task):
+        del memory, task
+        return params
+
+    return Method(
+        init=init,
+        start_task=start_task,
+        distribution=distribution,
+        penalty=penalty,
+        inspect=lambda params, memory, _: {"alignment": moved(params, memory)},
+        end_task=lambda params, memory, task, selection: (
+            params,
+            (jnp.asarray(True), params.hidden),
+        ),
+        policy=policy,
+        act=lambda params, x: distribution(params, None, None, x),
+        size=lambda params, memory: jnp.zeros((), int),
+    )
+
+
+def test_one_mode_is_ft_l2_with_a_permutation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = Entry(permuted_l2, FtL2Settings, lambda *_: FtL2Settings())
+    monkeypatch.setitem(METHODS, "permuted_l2", entry)
+    shared = {"selection_episodes": 0, "seed": 5, "interactions": 640}
+    options = RewireSettings(alignment="off", noise=0.0, tau=0.5, beta=0.3, alpha=1.0)
+    sac = dataclasses.replace(small().sac, hidden=13, lr_policy=1e-2)
+    settings = dataclasses.replace(small(**shared), options=options, sac=sac)
+    swept = run_sweep(tmp_path / "sweep", settings, axes={"modes": [3, 1]})
+    plain = dataclasses.replace(
+        settings, method="permuted_l2", options=FtL2Settings(coefficient=0.3)
+    )
+    folder = train_run.train(plain, tmp_path / "plain")
+    found = rows(swept, "training.jsonl")
+    moved = 0
+    for row in map(json.loads, (folder / "training.jsonl").read_text().splitlines()):
+        modes, one = (
+            found[row["stage"], member, row["interactions"]] for member in (0, 1)
+        )
+        for name, value in row.items():
+            if name not in ("member", "return"):
+                near_value = pytest.approx(value, rel=2e-3, abs=1e-5)
+                assert one[name] == near_value, (name, row)
+        assert one["distillation"] == 0
+        moved += modes["q"] != pytest.approx(row["q"], rel=2e-3)
+    # It is not only the environment that they have in common.
+    assert moved > 8
+    assert one["alignment"] > 0

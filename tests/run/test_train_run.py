@@ -1,0 +1,348 @@
+import dataclasses
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import rewire_jax
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import Settings
+from rewire_jax.envs.base import TaskChange
+from rewire_jax.envs.scenarios import ScenarioSpec, make_scenario
+from rewire_jax.reports.run_report import write_report
+from rewire_jax.run import run_state, train_run
+from rewire_jax.storage import checkpoint
+from rewire_jax.training import run_setup
+from rewire_jax.training.compiled_functions import rollout_function
+from tests.tiny import flags, tiny
+
+TABLES = ("results.jsonl", "training.jsonl")
+
+
+def arguments(settings: Settings, out: Path) -> list[str]:
+    return ["train", settings.scenario, "--out", str(out), *flags(settings)]
+
+
+def command(words: list[str]) -> list[str]:
+    return [sys.executable, "-m", "rewire_jax.cli.main", *words]
+
+
+def rows(folder: Path, table: str = "results.jsonl") -> list[dict]:
+    return [json.loads(line) for line in (folder / table).read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return train_run.train(tiny(), folder, log=["tensorboard"])
+
+
+def checkpoints(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "checkpoints").iterdir())
+
+
+def leaves(folder: Path, settings: Settings) -> list[np.ndarray]:
+    prepared = run_setup.prepare(settings)
+    learner = jax.eval_shape(prepared.program.init, prepared.members)
+    like = {"policy": (learner.params, learner.memory), "critic": learner.critic}
+    items, _ = checkpoint.load(run_state.kept(folder, None), like)
+    return jax.tree.leaves(items)
+
+
+def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
+    places = [(row["stage"], row["task"], row["seed"]) for row in rows(run)]
+    expected = [(s, t, m) for s in range(-1, 4) for m in range(2) for t in range(4)]
+    assert sorted(places) == sorted(expected)
+    assert checkpoints(run) == [f"task-{task:03d}" for task in (1, 2, 3, 4)]
+    last = rows(run)[-1]
+    assert last["interactions"]["training"] == 4 * 640
+    # Two episodes of each of three modes at start and end of each of four tasks.
+    steps = make_scenario("probe/reach").environment.episode_length
+    assert last["interactions"]["selection"] == 2 * 4 * 3 * 2 * steps
+    assert len({row["return"] for row in rows(run)}) > 10
+    assert list((run / "tensorboard").glob("seed-*/events*"))
+    report = write_report([run], run / "report")
+    assert all(path.exists() for path in report.paths)
+
+
+def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    words = arguments(tiny(), folder)
+    process = subprocess.Popen(command(words), stderr=subprocess.PIPE)
+    table = folder / "training.jsonl"
+    while process.poll() is None:
+        # In the middle of the second task, past its full checkpoint.
+        if table.exists() and len(table.read_text().splitlines()) >= 2 * (4 + 2):
+            process.send_signal(signal.SIGKILL)
+            break
+        time.sleep(0.002)
+    assert process.wait() == -signal.SIGKILL
+    assert checkpoints(folder)[-1] != "task-004"
+    subprocess.run(command([*words, "--resume"]), check=True, capture_output=True)
+    for name in TABLES:
+        assert (folder / name).read_bytes() == (run / name).read_bytes()
+    for ours, theirs in zip(leaves(folder, tiny()), leaves(run, tiny()), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_run_may_be_older_than_a_setting(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    header = json.loads((copy / "settings.json").read_text())
+    del header["settings"]["sac"]["noise_color"]
+    (copy / "settings.json").write_text(json.dumps(header))
+    train_run.train(tiny(), copy, resume=True)
+    sac = dataclasses.replace(tiny().sac, noise_color=1.0)
+    with pytest.raises(UserError, match=r"--noise-color was 0\.0, not 1\.0"):
+        train_run.train(dataclasses.replace(tiny(), sac=sac), copy, resume=True)
+
+
+class _Stop(Exception):
+    pass
+
+
+def stop_after(
+    monkeypatch: pytest.MonkeyPatch, times: int, name: str = "chunk"
+) -> None:
+    called = getattr(train_run.Run, name)
+    calls = []
+
+    def counting(self, *rest):
+        if len(calls) == times:
+            raise _Stop
+        calls.append(None)
+        return called(self, *rest)
+
+    monkeypatch.setattr(train_run.Run, name, counting)
+
+
+# PackNet in the updates after its second pruning; CSP with labels in its buffer, in a
+# task that ends with a search.
+@pytest.mark.parametrize(
+    ("method", "times", "name", "resumed"),
+    [
+        ("packnet", 3, "polish", "task-001-step-0000040"),
+        ("csp", 5, "chunk", "task-001-step-0000020"),
+    ],
+)
+def test_what_a_method_needs_within_a_task_is_saved(
+    method: str,
+    times: int,
+    name: str,
+    resumed: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=1)
+    whole = train_run.train(settings, tmp_path / "whole")
+    with monkeypatch.context() as patch:
+        stop_after(patch, times, name)
+        with pytest.raises(_Stop):
+            train_run.train(settings, tmp_path / "parts")
+    assert checkpoints(tmp_path / "parts")[-1] == resumed
+    parts = train_run.train(settings, tmp_path / "parts", resume=True)
+    for table in TABLES:
+        assert (parts / table).read_bytes() == (whole / table).read_bytes()
+    for ours, theirs in zip(
+        leaves(parts, settings), leaves(whole, settings), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(("chunks", "damaged"), [(7, 1), (7, 2), (4, 1), (1, 0)])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(
+    run: Path,
+    tmp_path: Path,
+    chunks: int,
+    damaged: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with monkeypatch.context() as patch:
+        stop_after(patch, chunks)
+        with pytest.raises(_Stop):
+            train_run.train(tiny(), tmp_path / "run")
+    found = checkpoint.available(tmp_path / "run" / "checkpoints")
+    for path in found[:damaged]:
+        largest = max(path.rglob("*"), key=lambda f: f.stat().st_size * f.is_file())
+        os.truncate(largest, largest.stat().st_size // 2)
+    train_run.train(tiny(), tmp_path / "run", resume=True)
+    assert capsys.readouterr().err.count("falling back") == min(damaged, len(found))
+    for name in TABLES:
+        assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes()
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_table_that_lost_rows_is_written_again(
+    run: Path, tmp_path: Path, table: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    lines = (copy / table).read_text().splitlines(keepends=True)
+    (copy / table).write_text("".join(lines)[:-3])
+    train_run.train(tiny(), copy, resume=True)
+    assert f"{table} has lost or foreign rows" in capsys.readouterr().err
+    for name in TABLES:
+        assert (copy / name).read_bytes() == (run / name).read_bytes()
+    assert checkpoints(copy) == checkpoints(run)
+
+
+def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
+    changes = [
+        TaskChange(name, extra={"goal": goal})
+        for name, goal in {"a": (1, 1), "b": (-1, 1), "c": (0, -1), "d": (1, 0)}.items()
+    ]
+    spec = ScenarioSpec("probe/eight", "reach", tuple(changes), 2, 640)
+    scenario = make_scenario(spec)
+    # A width of its own, so that no other test's traces are counted.
+    settings = tiny(scenario)
+    settings = dataclasses.replace(
+        settings, tasks=8, sac=dataclasses.replace(settings.sac, hidden=12)
+    )
+    prepared = run_setup.prepare(settings, scenario)
+    made = rewire_jax.methods.find_method("rewire").make(
+        prepared.spec, prepared.settings.options
+    )
+    # Evaluation; selection of each of three modes. Other tests use them, too.
+    shared = [
+        rollout_function(
+            scenario.environment, made.act, *sizes, prepared.mesh, "episode"
+        )
+        for sizes in ((8, 4), (3, 2))
+    ]
+    before = [function._cache_size() for function in shared]
+    train_run.train(settings, tmp_path / "run", scenario=scenario)
+    assert [f._cache_size() - n for f, n in zip(shared, before, strict=True)] == [1, 1]
+    # The last two are not for this method, those before are not compiled.
+    others = (
+        "rollout",
+        "trial",
+        "baseline",
+        "expect",
+        "traces",
+        "consolidate",
+        "polish",
+    )
+    program = prepared.program._asdict()
+    program = {name: f for name, f in program.items() if name not in others}
+    assert {name: f._cache_size() for name, f in program.items()} == dict.fromkeys(
+        program, 1
+    )
+    assert len(rows(tmp_path / "run")) == 9 * 8 * 2
+
+
+def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "elsewhere"
+    subprocess.run(["cp", "-r", str(run), str(copy)], check=True)
+    prepared = run_setup.prepare(tiny())
+    environment = prepared.scenario.environment
+    for task, seed in ((0, 0), (2, 1)):
+        policy = rewire_jax.load_policy(copy, task=task, seed=seed)
+        one = jnp.asarray([0.3, -0.2])
+        many = jnp.stack([one, -one, 2 * one])
+        single = jax.jit(policy)(one)
+        assert single.shape == (2,)
+        np.testing.assert_allclose(jax.vmap(policy)(many)[0], single, atol=1e-6)
+        np.testing.assert_allclose(policy(many)[0], single, atol=1e-6)
+        # It plays as the run's own evaluation says.
+        data = prepared.scenario.tasks[task].data
+        saved = [
+            row["return"]
+            for row in rows(run)
+            if (row["stage"], row["task"], row["seed"]) == (3, task, seed)
+        ]
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), 4)
+        keys = jax.random.split(jax.random.fold_in(key, task), 4)
+
+        def play(key, policy=policy, data=data):
+            state = environment.reset(data, key)
+
+            def step(carry, _):
+                state, total = carry
+                state = environment.step(data, state, policy(state.observation))
+                return (state, total + state.reward), None
+
+            carry = (state, jnp.zeros(()))
+            return jax.lax.scan(step, carry, length=environment.episode_length)[0][1]
+
+        assert np.mean(jax.vmap(play)(keys)) == pytest.approx(saved[0], rel=1e-4)
+    earlier = rewire_jax.load_policy(copy, task=0, stage=0)
+    assert not np.allclose(earlier(one), rewire_jax.load_policy(copy, task=0)(one))
+    for wrong in ({"task": 9}, {"task": 0, "seed": 7}, {"task": 0, "stage": 8}):
+        with pytest.raises(UserError):
+            rewire_jax.load_policy(copy, **wrong)
+
+
+@pytest.mark.parametrize("stage", [None, 1])
+def test_all_policies_are_one_function_of_what_was_learned(run: Path, stage) -> None:
+    policies = rewire_jax.load_policies(run, stage=stage)
+    assert policies.seeds == (0, 1)
+    assert len(policies.tasks) == 4
+    observations = jax.random.normal(jax.random.key(0), (2, 4, 3, 2))
+    over_tasks = jax.vmap(policies.act, (None, 0, 0))
+    over_all = jax.jit(jax.vmap(over_tasks, (0, None, 0)))
+    actions = over_all(policies.members, jnp.arange(4), observations)
+    for seed, task in itertools.product(range(2), range(4)):
+        one = rewire_jax.load_policy(run, task=task, seed=seed, stage=stage)
+        np.testing.assert_allclose(
+            actions[seed, task], one(observations[seed, task]), atol=1e-6
+        )
+
+
+def test_what_is_learned_can_be_taken_apart(run: Path) -> None:
+    policies = rewire_jax.load_policies(run)
+    first = jax.tree.map(lambda leaf: leaf[0], policies.members)
+    orders = first.memory.orders
+    np.testing.assert_array_equal(
+        np.sort(orders, axis=-1), np.broadcast_to(np.arange(16), orders.shape)
+    )
+    # Whoever has another task's wiring acts otherwise.
+    exchanged = first._replace(memory=first.memory._replace(orders=orders[::-1]))
+    seen = jnp.array([0.3, -0.2])
+    assert not np.allclose(
+        policies.act(first, 0, seen), policies.act(exchanged, 0, seen), atol=1e-4
+    )
+    with pytest.raises(UserError, match="no checkpoint of task 8"):
+        rewire_jax.load_policies(run, stage=8)
+
+
+def test_evaluate_replays_a_run(run: Path) -> None:
+    played = rewire_jax.evaluate(run, episodes=64)
+    final = {(r["task"], r["seed"]): r["return"] for r in rows(run) if r["stage"] == 3}
+    assert len(played) == len(final)
+    for row in played:
+        # Other episodes, same policy: within the spread of the run's four episodes.
+        spread = 4 * row["std"] / 2
+        assert abs(row["return"] - final[row["task"], row["seed"]]) < spread
+
+
+def test_a_frozen_seed_is_marked_and_the_other_goes_on(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = train_run.Run.begin
+
+    def poisoned(self, now, task):
+        now = begin(self, now, task)
+        if now.stage == 1:
+            learner = now.state.learner
+            critic = jax.tree.map(lambda x: x.at[0].set(jnp.nan), learner.critic)
+            state = now.state._replace(learner=learner._replace(critic=critic))
+            now = now._replace(state=state)
+        return now
+
+    monkeypatch.setattr(train_run.Run, "begin", poisoned)
+    train_run.train(tiny(), tmp_path / "run")
+    marked = {(r["stage"], r["seed"]) for r in rows(tmp_path / "run") if r["diverged"]}
+    assert marked == {(1, 0), (2, 0), (3, 0)}
+    # The other seed is what it was, but for the order of float sums.
+    for ours, theirs in zip(rows(tmp_path / "run"), rows(run), strict=True):
+        if ours["seed"] == 1:
+            assert ours["return"] == pytest.approx(theirs["return"], rel=1e-3)

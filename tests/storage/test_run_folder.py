@@ -1,0 +1,99 @@
+import json
+from pathlib import Path
+
+import pytest
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import to_json
+from rewire_jax.storage import run_folder
+from rewire_jax.storage.run_folder import HEADER, held
+from rewire_jax.training import run_setup
+from tests.tiny import tiny
+
+HEAD = {"settings": to_json(tiny()), "provenance": {"versions": {}, "commit": "abc"}}
+
+
+def test_one_at_a_time_has_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with held(folder, HEAD):
+        with (
+            pytest.raises(UserError, match="another process trains"),
+            held(folder, None),
+        ):
+            raise AssertionError
+        with pytest.raises(UserError, match="another run"), held(folder, HEAD):
+            raise AssertionError
+    with held(folder, None):
+        pass
+    with pytest.raises(UserError, match="another run"), held(folder, HEAD):
+        raise AssertionError
+
+
+def test_a_start_that_was_cut_short_is_no_obstacle(tmp_path: Path) -> None:
+    (tmp_path / ".lock").touch()
+    (tmp_path / f".{HEADER}").write_text("{")
+    with pytest.raises(UserError, match="holds no run"), held(tmp_path, None):
+        raise AssertionError
+    with held(tmp_path, HEAD):
+        assert run_folder.read_header(tmp_path)["format"] == run_folder.FORMAT
+
+
+def test_nothing_is_left_where_something_else_is(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").touch()
+    for header in (HEAD, None):
+        with pytest.raises(UserError), held(tmp_path, header):
+            raise AssertionError
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda head: head["settings"].update(lookahead=1),
+            "unknown setting lookahead",
+        ),
+        (lambda head: head["settings"]["sac"].update(a=1), "unknown setting a;"),
+        (lambda head: head["settings"].pop("tasks"), "no setting tasks;"),
+        (lambda head: head.update(format=7), "format 7, not 1"),
+    ],
+)
+def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> None:
+    head = json.loads(json.dumps(HEAD)) | {"format": run_folder.FORMAT}
+    change(head)
+    for versions, named in (
+        ({"rewire_jax": "9.8"}, "written by rewire_jax 9.8, commit abc"),
+        ({}, "written by rewire_jax of an unknown version"),
+    ):
+        head["provenance"]["versions"] = versions
+        (tmp_path / HEADER).write_text(json.dumps(head))
+        for read in (
+            lambda: run_setup.saved(tmp_path),
+            lambda: run_folder.compare(tmp_path, tiny()),
+        ):
+            with pytest.raises(UserError, match=said) as caught:
+                read()
+            assert named in str(caught.value)
+
+
+def test_what_was_written_since_is_cut_off(tmp_path: Path) -> None:
+    run_folder.append(tmp_path, "results.jsonl", [{"a": 1}, {"a": 2}])
+    marks = json.loads(json.dumps(run_folder.marks(tmp_path)))
+    run_folder.append(tmp_path, "results.jsonl", [{"a": 3}])
+    run_folder.append(tmp_path, "timing.jsonl", [{"a": 4}])
+    assert run_folder.changed(tmp_path, marks) is None
+    run_folder.cut(tmp_path, marks)
+    assert (tmp_path / "results.jsonl").read_text() == '{"a": 1}\n{"a": 2}\n'
+    assert (tmp_path / "timing.jsonl").read_text() == ""
+
+
+@pytest.mark.parametrize("text", ['{"a": 1}\n{"a"', '{"a": 1}\n{"a": 7}\n', ""])
+def test_rows_that_are_lost_or_others_are_noticed(tmp_path: Path, text: str) -> None:
+    run_folder.append(tmp_path, "results.jsonl", [{"a": 1}, {"a": 2}])
+    marks = run_folder.marks(tmp_path)
+    (tmp_path / "results.jsonl").write_text(text)
+    assert run_folder.changed(tmp_path, marks) == tmp_path / "results.jsonl"
+    # Earlier versions noted lengths alone.
+    lengths = {"results.jsonl": 18}
+    noticed = run_folder.changed(tmp_path, lengths) is not None
+    assert noticed == (len(text) < 18)

@@ -1,0 +1,54 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rewire_jax import preset
+from rewire_jax.envs.scenarios import list_scenarios, make_scenario
+from rewire_jax.training import run_setup
+
+TASKS = {"halfcheetah": 8, "ant": 8, "humanoid": 4}
+
+
+@pytest.mark.parametrize("domain", TASKS)
+def test_every_scenario_trains_through_all_its_tasks_in_one_program(domain) -> None:
+    programs = set()
+    names = [name for name in list_scenarios() if name.startswith(f"{domain}/")]
+    assert len(names) == {"humanoid": 1}.get(domain, 4)
+    for name in names:
+        scenario = make_scenario(name)
+        settings = preset(scenario, "ft1")
+        sac = dataclasses.replace(
+            settings.sac, hidden=8, batch_size=4, policy_delay=1, target_delay=1
+        )
+        settings = dataclasses.replace(
+            settings, seeds=2, interactions=8, envs=2, updates=2, warmup=4, sac=sac
+        )
+        prepared = run_setup.prepare(settings, scenario)
+        program, members = prepared.program, prepared.members
+        programs.add(program)
+        learner, alive = program.init(members), jnp.ones(2, bool)
+        first = []
+        assert len(prepared.names) == TASKS[domain]
+        for index, task in enumerate(scenario.tasks):
+            state = program.begin(members, learner, alive, index, task.data)
+            first.append(np.asarray(state.collection.episodes.state.observation))
+            state, report = program.chunk(members, state, index, task.data, 0, 4)
+            before, learner = learner, state.learner
+            assert bool(jnp.all(state.alive))
+            assert np.all(np.asarray(report.updates) == 2)
+            moved = jax.tree.map(
+                lambda a, b: float(jnp.max(jnp.abs(a - b))),
+                before.params,
+                learner.params,
+            )
+            assert min(jax.tree.leaves(moved)) > 0
+            hidden = task.observation_mask == 0
+            assert np.all(first[-1][..., hidden] == 0)
+        assert not np.array_equal(first[0][0], first[0][1])  # seeds differ
+    # One compilation served all scenarios and tasks of the domain.
+    assert len(programs) == 1
+    assert program.chunk._cache_size() == 1
+    assert program.begin._cache_size() == 1
