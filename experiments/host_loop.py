@@ -20,7 +20,7 @@ import rewire_jax
 from experiments import suite
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
-from rewire_jax.envs.vector_env import Lanes
+from rewire_jax.envs.vector_env import VectorEnv
 from rewire_jax.training.run_setup import Plan, prepare
 
 
@@ -75,13 +75,13 @@ class Loop:
 
     def updates(self, times: int) -> None:
         """Updates alone."""
-        self.state = self.plan.program.polish(
+        self.state = self.plan.program.offline_update(
             self.plan.members, self.state, 0, self.time, 0, times
         )
         jax.block_until_ready(self.state)
 
 
-def simulate(lanes: Lanes, environment: HostEnvironment, steps: int) -> None:
+def simulate(lanes: VectorEnv, environment: HostEnvironment, steps: int) -> None:
     """Steps simulators with random actions, and resets them at their episodes' end."""
     draw = np.random.default_rng(0)
     count = len(lanes.seeds)
@@ -112,7 +112,7 @@ def measure(job: HostLoop, method: str, width: int) -> dict[str, Any]:
         Loop(prepare(dataclasses.replace(settings, overlap=overlap), scenario))
         for overlap in (False, True)
     ]
-    lanes = Lanes(environment, job.seeds * settings.envs)
+    lanes = VectorEnv(environment, job.seeds * settings.envs)
     rounds = []
     for _ in range(job.rounds):
         steps = job.times * settings.update_every

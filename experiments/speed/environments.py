@@ -12,7 +12,7 @@ from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.timing import Loop, in_turn
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.scenarios import BRAX_BACKENDS, make_scenario
-from rewire_jax.envs.vector_env import Lanes
+from rewire_jax.envs.vector_env import VectorEnv
 from rewire_jax.reports import plots
 
 BRAX = "halfcheetah/forgetting"
@@ -78,7 +78,7 @@ def measure(effort: Effort) -> list[Row]:
         host = make_scenario(META_WORLD).environment
         assert isinstance(host, HostEnvironment)
         for count in LANES:
-            loop = functools.partial(simulate, Lanes(host, count), host)
+            loop = functools.partial(simulate, VectorEnv(host, count), host)
             loops["Meta-World, window-close", "MuJoCo", count] = loop
     timings = in_turn(loops, min(effort.rounds, 5), effort.seconds)
     rows = []

@@ -55,7 +55,7 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
             return jax.tree.map(lambda x: x[number], batches)
 
         def draw(key):
-            return sac.draw(key, learner.memory, (), size, method, member.sac)
+            return sac.sample_noise(key, learner.memory, (), size, method, member.sac)
 
         def several(number, learner):
             key, first = jax.random.fold_in(member.keys, number), number * drawn

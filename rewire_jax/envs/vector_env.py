@@ -17,7 +17,7 @@ from rewire_jax.envs.base import HostEnvironment, Task
 Array = NDArray[Any]
 
 
-class Moment(NamedTuple):
+class StepResult(NamedTuple):
     """What a step gave in each lane.
 
     Attributes:
@@ -33,7 +33,7 @@ class Moment(NamedTuple):
     success: Array
 
 
-class Lanes:
+class VectorEnv:
     """Simulators that are reset and stepped together.
 
     They are no state of a run, but remember where they are: what seeds and actions
@@ -89,14 +89,14 @@ class Lanes:
         self.steps = np.where(where, 0, self.steps)
         return self.observation
 
-    def step(self, actions: Array) -> Moment:
+    def step(self, actions: Array) -> StepResult:
         """Steps all lanes; `actions` is `[lanes, actions]` float32 in [-1, 1]."""
         with _whole():
             observation, reward, terminal, _, info = self._vector.step(actions)
         self.observation = observation
         self.steps = self.steps + 1
         success = info.get("success", np.zeros(len(self.seeds), bool))
-        return Moment(
+        return StepResult(
             observation, reward.astype(np.float32), terminal, success.astype(bool)
         )
 
@@ -151,6 +151,6 @@ def shown(observation: Array, task: Task, shape: tuple[int, ...]) -> Array:
 
 
 @functools.lru_cache(maxsize=1)
-def open_lanes(environment: HostEnvironment, count: int) -> Lanes:
+def open_lanes(environment: HostEnvironment, count: int) -> VectorEnv:
     """So many lanes; asked for again, the same, since starting them takes seconds."""
-    return Lanes(environment, count)
+    return VectorEnv(environment, count)

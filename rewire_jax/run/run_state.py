@@ -20,13 +20,13 @@ from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.json_lines import reading
 from rewire_jax.training import population
 from rewire_jax.training.run_setup import Plan
-from rewire_jax.training.sac import Learner
-from rewire_jax.training.train_loop import State
+from rewire_jax.training.sac import TrainState
+from rewire_jax.training.train_loop import RunnerState
 
 _FOLDER = "checkpoints"
 
 
-class Standing(NamedTuple):
+class RunState(NamedTuple):
     """Where a run stands; between tasks `state` is None and `steps` 0.
 
     Attributes:
@@ -41,16 +41,16 @@ class Standing(NamedTuple):
 
     stage: int
     steps: int
-    learner: Learner | None
-    state: State | None
+    learner: TrainState | None
+    state: RunnerState | None
     before: jax.Array | None
     alive: np.ndarray
     selection: jax.Array
 
 
-def start(plan: Plan) -> Standing:
+def start(plan: Plan) -> RunState:
     """Before the first task."""
-    return Standing(
+    return RunState(
         stage=0,
         steps=0,
         learner=plan.program.init(plan.members),
@@ -61,13 +61,13 @@ def start(plan: Plan) -> Standing:
     )
 
 
-def interactions(standing: Standing, plan: Plan) -> int:
+def interactions(standing: RunState, plan: Plan) -> int:
     """Of each member, in all tasks together."""
     steps = min(standing.steps, plan.steps)
     return standing.stage * plan.interactions + steps * plan.settings.envs
 
 
-def save(folder: Path, standing: Standing) -> None:
+def save(folder: Path, standing: RunState) -> None:
     """Writes a checkpoint, and drops those from within a task that it outdates."""
     items: dict[str, Any] = {
         "counts": {"alive": standing.alive, "selection": standing.selection}
@@ -113,7 +113,7 @@ def finished(folder: Path, stage: int) -> bool:
     return (folder / _FOLDER / _name(stage + 1)).exists()
 
 
-def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | None:
+def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | None:
     """The newest standing whose checkpoint and rows are whole, None if there is none.
 
     What the run's tables hold beyond it is cut off.
@@ -141,7 +141,7 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> Standing | 
     return None
 
 
-def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, run_folder.Mark]]:
+def _load(path: Path, plan: Plan) -> tuple[RunState, dict[str, run_folder.Mark]]:
     program, members = plan.program, plan.members
     learner = jax.eval_shape(program.init, members)
     like: dict[str, Any] = {"counts": _counts(plan)}
@@ -149,7 +149,7 @@ def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, run_folder.Mark]]
     saved = metadata["items"]
     if "state" in saved:
         task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-        like["state"] = program.expect(
+        like["state"] = program.state_shape(
             members, learner, like["counts"]["alive"], 0, task
         )
     else:
@@ -161,7 +161,7 @@ def _load(path: Path, plan: Plan) -> tuple[Standing, dict[str, run_folder.Mark]]
     if "policy" in items:
         return between(metadata["stage"], items, plan), metadata["tables"]
     items = population.place(items, plan.mesh)
-    return Standing(
+    return RunState(
         stage=metadata["stage"],
         steps=metadata["steps"],
         learner=None,
@@ -228,11 +228,11 @@ def _facts(path: Path) -> dict[str, Any]:
     return facts
 
 
-def between(stage: int, items: dict[str, Any], plan: Plan) -> Standing:
+def between(stage: int, items: dict[str, Any], plan: Plan) -> RunState:
     """The standing before a task, from what is kept after the one before."""
     items = population.place(items, plan.mesh)
     params, memory = items["policy"]
-    return Standing(
+    return RunState(
         stage=stage,
         steps=0,
         # The rest of a learner starts anew with the next task.
@@ -253,7 +253,7 @@ def _counts(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _kept(learner: Learner) -> dict[str, Any]:
+def _kept(learner: TrainState) -> dict[str, Any]:
     return {"policy": (learner.params, learner.memory), "critic": learner.critic}
 
 

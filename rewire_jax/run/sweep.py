@@ -33,7 +33,7 @@ from rewire_jax.run import loggers, run_state
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.ranking import rank
-from rewire_jax.run.run_state import Standing
+from rewire_jax.run.run_state import RunState
 from rewire_jax.run.sweep_grid import configure, draws, grid, read
 from rewire_jax.run.train_run import Run, Stopped, interruptible
 from rewire_jax.storage import checkpoint, run_folder
@@ -162,7 +162,7 @@ class Sweep:
             logs = stack.enter_context(Loggers(self.log, subjects, display.message))
             run = Run(plan, folder, display, logs, choosing=True)
 
-            def start() -> Standing:
+            def start() -> RunState:
                 now = run_state.restore(folder, plan, display.message)
                 if now is None and stage:
                     now = self.gather(stage, plan)
@@ -189,7 +189,7 @@ class Sweep:
             left += math.ceil(batches / self.halving**later / processes)
         return left
 
-    def gather(self, stage: int, plan: Plan) -> Standing:
+    def gather(self, stage: int, plan: Plan) -> RunState:
         """A batch's members as they were after the task before, wherever that was."""
         found: dict[int, Any] = {}
         wanted = {member.number for member in plan.crowd}

@@ -20,11 +20,11 @@ from rewire_jax.methods.base import Selection, map_own
 from rewire_jax.run import interrupts, loggers, run_state
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
-from rewire_jax.run.run_state import Standing
+from rewire_jax.run.run_state import RunState
 from rewire_jax.storage import run_folder
 from rewire_jax.training import memory_estimate, population, rollout, train_loop
 from rewire_jax.training.run_setup import Plan, base_size, prepare
-from rewire_jax.training.sac import Learner
+from rewire_jax.training.sac import TrainState
 
 # Streams of randomness beside training's, which is 1.
 _EVALUATION, _SELECTION, _CHOICE = 2, 3, 4
@@ -63,7 +63,7 @@ class Run:
         self.ahead = 0
         self.stopping = False
 
-    def start(self, now: Standing | None = None) -> Standing:
+    def start(self, now: RunState | None = None) -> RunState:
         """The beginning of the run, after the evaluation of untrained policies.
 
         Args:
@@ -77,7 +77,7 @@ class Run:
         self.evaluate(now, -1)
         return now
 
-    def task(self, now: Standing, ahead: int) -> Standing:
+    def task(self, now: RunState, ahead: int) -> RunState:
         """Trains what is left of a task, and concludes it.
 
         Args:
@@ -93,9 +93,9 @@ class Run:
         task = jax.tree.map(lambda leaf: leaf[stage], plan.tasks)
         if now.state is None:
             now = self.begin(now, task)
-        while now.steps < plan.steps + plan.polishing:
-            polishing = now.steps >= plan.steps
-            now = self.polish(now) if polishing else self.chunk(now, task)
+        while now.steps < plan.steps + plan.offline_steps:
+            offline = now.steps >= plan.steps
+            now = self.offline_update(now) if offline else self.chunk(now, task)
             if self.stopping:
                 run_state.save(self.folder, now)
                 raise Stopped(
@@ -110,7 +110,7 @@ class Run:
         self.progress.finish_task(stage, returns, clock.perf_counter() - began)
         return now
 
-    def begin(self, now: Standing, task: Task) -> Standing:
+    def begin(self, now: RunState, task: Task) -> RunState:
         """Starts a task: fresh optimisers, environments and buffer."""
         program, members, stage = self.plan.program, self.plan.members, now.stage
         state = program.begin(members, now.learner, now.alive, stage, task)
@@ -121,7 +121,7 @@ class Run:
         return now._replace(before=before, selection=selection)
 
     def select(
-        self, now: Standing, learner: Learner, task: Task, phase: int
+        self, now: RunState, learner: TrainState, task: Task, phase: int
     ) -> tuple[jax.Array | None, jax.Array]:
         """Rolls out the candidates at the start (phase 0) or end (1) of a task.
 
@@ -152,7 +152,7 @@ class Run:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""
         return _make_keys(self.plan.members.keys, stream, number, rows)
 
-    def chunk(self, now: Standing, task: Task) -> Standing:
+    def chunk(self, now: RunState, task: Task) -> RunState:
         """Trains until the next progress report."""
         began = clock.perf_counter()
         program, members, stage = self.plan.program, self.plan.members, now.stage
@@ -171,14 +171,14 @@ class Run:
         self.save(now, done)
         return now
 
-    def polish(self, now: Standing) -> Standing:
+    def offline_update(self, now: RunState) -> RunState:
         """Updates from the buffer until the next progress report."""
         began = clock.perf_counter()
         plan, stage = self.plan, now.stage
         before = now.steps
-        steps = self.due(before, plan.steps + plan.polishing, 1)
-        compiled = plan.program.polish._cache_size()  # type: ignore[attr-defined]
-        state = plan.program.polish(
+        steps = self.due(before, plan.steps + plan.offline_steps, 1)
+        compiled = plan.program.offline_update._cache_size()  # type: ignore[attr-defined]
+        state = plan.program.offline_update(
             plan.members, now.state, stage, plan.steps, before - plan.steps, steps
         )
         now = self.advance(now, state, steps)
@@ -187,11 +187,11 @@ class Run:
             "interactions": plan.interactions,
             "polishing": now.steps - plan.steps,
             "seconds": clock.perf_counter() - began,
-            "compile": plan.program.polish._cache_size() > compiled,  # type: ignore
+            "compile": plan.program.offline_update._cache_size() > compiled,  # type: ignore
             "memory": memory_estimate.most_held(),
         }
         run_folder.append(self.folder, "timing.jsonl", [timing])
-        share = (now.steps - plan.steps) / plan.polishing
+        share = (now.steps - plan.steps) / plan.offline_steps
         self.progress.update(
             stage,
             plan.interactions,
@@ -212,7 +212,9 @@ class Run:
         every = max(times, 1) * unit
         return min(every - done % every, end - done)
 
-    def advance(self, now: Standing, state: train_loop.State, steps: int) -> Standing:
+    def advance(
+        self, now: RunState, state: train_loop.RunnerState, steps: int
+    ) -> RunState:
         """The run after these steps; tells of members that were frozen in them."""
         alive = np.array(state.alive)
         lost = now.alive & ~alive
@@ -224,18 +226,18 @@ class Run:
                 )
         return now._replace(steps=now.steps + steps, state=state, alive=alive)
 
-    def save(self, now: Standing, before: int) -> None:
+    def save(self, now: RunState, before: int) -> None:
         """Writes a checkpoint from within a task if one is due after `before`."""
         settings = self.plan.settings
         interval = max(settings.checkpoint_every // settings.envs, 1)
         due = settings.checkpoint_every and now.steps // interval > before // interval
-        if due and now.steps < self.plan.steps + self.plan.polishing:
+        if due and now.steps < self.plan.steps + self.plan.offline_steps:
             run_state.save(self.folder, now)
 
     def log(
         self,
-        now: Standing,
-        report: train_loop.Report,
+        now: RunState,
+        report: train_loop.ChunkMetrics,
         seconds: float,
         compiled: bool,
         steps: int,
@@ -284,7 +286,7 @@ class Run:
             )
         rate = steps * settings.envs * len(rows) / seconds
         # As if steps that only update took as long as the others.
-        steps_left = (plan.steps + plan.polishing) * (self.ahead + 1)
+        steps_left = (plan.steps + plan.offline_steps) * (self.ahead + 1)
         left = (steps_left - now.steps) * settings.envs
         self.progress.update(
             stage,
@@ -294,14 +296,14 @@ class Run:
             None if compiled else left * len(rows) / rate,
         )
 
-    def conclude(self, now: Standing, task: Task) -> Standing:
+    def conclude(self, now: RunState, task: Task) -> RunState:
         """Lets the method choose among its candidates, and end the task."""
         program, members, stage = self.plan.program, self.plan.members, now.stage
         learner = now.learner
         assert learner is not None
         after, spent = self.select(now, learner, task, 1)
         chosen_by = None if after is None else Selection(now.before, after)
-        return Standing(
+        return RunState(
             stage=stage + 1,
             steps=0,
             learner=program.finish(members, learner, stage, chosen_by),
@@ -311,7 +313,7 @@ class Run:
             selection=spent,
         )
 
-    def evaluate(self, now: Standing, stage: int) -> np.ndarray:
+    def evaluate(self, now: RunState, stage: int) -> np.ndarray:
         """Plays all tasks without exploration; returns `[members, tasks]`."""
         plan, settings = self.plan, self.plan.settings
         program, members = plan.program, plan.members

@@ -27,7 +27,12 @@ from rewire_jax.training import (
     sac,
     train_loop,
 )
-from rewire_jax.training.train_loop import Collection, Report, Shape, State
+from rewire_jax.training.train_loop import (
+    ChunkMetrics,
+    CollectorState,
+    LoopConfig,
+    RunnerState,
+)
 
 
 class Program(NamedTuple):
@@ -36,37 +41,37 @@ class Program(NamedTuple):
     A function is traced once, whatever the task: tasks and times are data.
 
     Attributes:
-      init: `members -> Learner`.
+      init: `members -> TrainState`.
       begin: `(members, learner, alive, index, task) -> State`, a task's start.
       chunk: `(members, state, index, task, time, steps) -> state, Report`, takes
         `steps` steps of all environments; the given state is used up.
-      consolidate: `(members, state, index, time) -> Learner`, the end of a task's
+      consolidate: `(members, state, index, time) -> TrainState`, the end of a task's
         interactions, `time` steps of all environments; or None.
-      polish: `(members, state, index, time, done, steps) -> state`, updates from the
-        buffer as in `steps` steps, `done` of which were made before.
+      offline_update: `(members, state, index, time, done, steps) -> state`, updates
+        from the buffer as in `steps` steps, `done` of which were made before.
       candidates: `(members, learner, index) -> Candidates`, or None.
-      finish: `(members, learner, index, Selection or None) -> Learner`.
+      finish: `(members, learner, index, Selection or None) -> TrainState`.
       policies: `(members, learner) -> policies [members, tasks]`; without the second
         axis what is `Shared`.
       rollout: `(tasks, policies, keys, count) -> Rollout`, see `rollout.episodes`.
       trial: the same for candidates, see `Method.candidate_score`.
-      expect: what `begin` gives for the same arguments, as shapes.
+      state_shape: what `begin` gives for the same arguments, as shapes.
       traces: `() -> int`, how often a function that trains was traced so far.
       size: `(members, learner) -> [members]`, numbers stored.
       baseline: whether candidates are rolled out at a task's start, too.
     """
 
-    init: Callable[..., sac.Learner]
-    begin: Callable[..., State]
-    chunk: Callable[..., tuple[State, Report]]
-    consolidate: Callable[..., sac.Learner] | None
-    polish: Callable[..., State]
+    init: Callable[..., sac.TrainState]
+    begin: Callable[..., RunnerState]
+    chunk: Callable[..., tuple[RunnerState, ChunkMetrics]]
+    consolidate: Callable[..., sac.TrainState] | None
+    offline_update: Callable[..., RunnerState]
     candidates: Callable[..., Candidates] | None
-    finish: Callable[..., sac.Learner]
+    finish: Callable[..., sac.TrainState]
     policies: Callable[..., Any]
     rollout: Callable[..., rollout.Rollout]
     trial: Callable[..., rollout.Rollout]
-    expect: Callable[..., State]
+    state_shape: Callable[..., RunnerState]
     traces: Callable[[], int]
     size: Callable[..., jax.Array]
     baseline: bool
@@ -99,7 +104,7 @@ def build(
     environment: Environment | HostEnvironment,
     make: Callable[[Spec, Any], Method],
     spec: Spec,
-    shape: Shape,
+    shape: LoopConfig,
     example: Any,
     mesh: Mesh,
 ) -> Program:
@@ -119,8 +124,8 @@ def build(
         return sac.init(key, make(spec, member.options), spec, member.sac)
 
     def task_keys(member, index):
-        # For the start, the steps, consolidation and polishing. A key is either split
-        # or folded, never both: `split(key)[i]` is the same key as `fold_in(key, i)`.
+        # For the start, the steps, consolidation and updates after it. A key is either
+        # split or folded, never both: `split(key)[i]` is the same as `fold_in(key, i)`.
         key = jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
         return jax.random.split(key, 4)
 
@@ -145,7 +150,9 @@ def build(
         )
         learner = sac.restart(learner, member.sac)
         acting = (learner.params, learner.memory) if shape.overlap else ()
-        return State(learner, Collection(buffer, episodes, label), alive, acting)
+        return RunnerState(
+            learner, CollectorState(buffer, episodes, label), alive, acting
+        )
 
     def consolidate(member, state, index, time):
         method = make(spec, member.options)
@@ -168,10 +175,10 @@ def build(
         learner = learner._replace(params=params, memory=memory)
         return sac.restart(learner, member.sac)
 
-    def polish(member, state, index, time, done, steps):
+    def offline_update(member, state, index, time, done, steps):
         method = make(spec, member.options)
         update = functools.partial(
-            train_loop.learn,
+            train_loop.update_from_buffer,
             due=True,
             updates=shape.updates,
             environment=environment,
@@ -236,7 +243,7 @@ def build(
     return Program(
         init=over(init, 0),
         consolidate=method.consolidate and over(consolidate, 0, 0, None, None),
-        polish=over(polish, 0, 0, None, None, None, None, donate=(1,)),
+        offline_update=over(offline_update, 0, 0, None, None, None, None, donate=(1,)),
         candidates=method.candidates and over(candidates, 0, 0, None),
         finish=over(finish, 0, 0, None, 0),
         policies=over(policies, 0, 0),
@@ -252,11 +259,11 @@ def _loop(
     make: Callable[[Any], Method],
     act: Callable[..., Any],
     task_keys: Callable[[Any, Any], jax.Array],
-    start: Callable[..., State],
-    shape: Shape,
+    start: Callable[..., RunnerState],
+    shape: LoopConfig,
     mesh: Mesh,
 ) -> host_train_loop.Loop:
-    """The loop of an environment that is compiled with the rest; see `host_train_loop.loop`."""
+    """The same as `host_train_loop.loop` of an environment that is compiled, too."""
 
     def begin(member, learner, alive, index, task):
         reset_key = jax.random.split(task_keys(member, index)[0], 4)[1]
@@ -290,6 +297,6 @@ def _loop(
         begin=begins,
         chunk=trains,
         rollout=episodes,
-        expect=functools.partial(jax.eval_shape, begins),
+        state_shape=functools.partial(jax.eval_shape, begins),
         traces=trains._cache_size,  # type: ignore[attr-defined]
     )

@@ -11,7 +11,7 @@ from rewire_jax.nn import networks
 from rewire_jax.training import colored_noise
 
 
-class Draw(NamedTuple):
+class ActionNoise(NamedTuple):
     """What a step of all environments of a member leaves to chance.
 
     Attributes:
@@ -29,13 +29,13 @@ class Draw(NamedTuple):
     blind: jax.Array
 
 
-def draw(
+def sample_noise(
     key: jax.Array,
     time: jax.Array,
     size: tuple[int, int],
     random: int,
     sequence: jax.Array | None,
-) -> Draw:
+) -> ActionNoise:
     """A draw for one step.
 
     Args:
@@ -50,7 +50,7 @@ def draw(
         noise = jax.random.normal(action_key, size)
     else:
         noise = sequence[time % len(sequence)]
-    return Draw(
+    return ActionNoise(
         context=jax.random.key_data(context_key),
         label=jax.random.key_data(label_key),
         noise=noise,
@@ -60,7 +60,7 @@ def draw(
 
 
 def explore(
-    draw: Draw,
+    draw: ActionNoise,
     acting: tuple[Params, Memory],
     label: Any,
     observation: jax.Array,
@@ -89,7 +89,7 @@ def explore(
     return jnp.where(draw.blind, draw.uniform, action), label
 
 
-def draw_sequence(
+def sample_colored(
     key: jax.Array,
     time: jax.Array,
     size: tuple[int, ...],

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs.base import HostEnvironment, State, Task
-from rewire_jax.envs.vector_env import Lanes, draw_seed, shown
+from rewire_jax.envs.vector_env import VectorEnv, draw_seed, shown
 from rewire_jax.training import rollout
 from rewire_jax.training.rollout import Episode, Step, Success
 
@@ -55,7 +55,7 @@ def begin(environment: HostEnvironment, number: Array, observation: Array) -> An
 
 def advance(
     environment: HostEnvironment,
-    lanes: Lanes,
+    lanes: VectorEnv,
     task: Task,
     roots: Array,
     episodes: Any,
@@ -96,8 +96,8 @@ def advance(
     ), Step(reward, terminal, truncated, last, following, score, success)
 
 
-def recall(
-    lanes: Lanes, task: Task, roots: Array, episodes: Any, buffer: Any, time: int
+def replay_actions(
+    lanes: VectorEnv, task: Task, roots: Array, episodes: Any, buffer: Any, time: int
 ) -> None:
     """Brings the simulators where the episodes are, by playing them again.
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.envs.base import HostEnvironment, Task
-from rewire_jax.envs.vector_env import Lanes, draw_seed, open_lanes, shown
+from rewire_jax.envs.vector_env import VectorEnv, draw_seed, open_lanes, shown
 from rewire_jax.methods.base import map_own
 from rewire_jax.training.rollout import Rollout, Success
 
@@ -69,7 +69,7 @@ def play(
 
 def _play(
     environment: HostEnvironment,
-    lanes: Lanes,
+    lanes: VectorEnv,
     act: Callable[..., Any],
     task: Task,
     policy: Any,

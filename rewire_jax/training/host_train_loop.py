@@ -25,18 +25,18 @@ from rewire_jax.training import exploration, host_episodes, population, train_lo
 from rewire_jax.training.host_rollout import play
 from rewire_jax.training.population import Members
 from rewire_jax.training.rollout import Rollout, Step
-from rewire_jax.training.train_loop import Collection, Report, Shape
+from rewire_jax.training.train_loop import ChunkMetrics, CollectorState, LoopConfig
 
 Array = NDArray[Any]
 
 
 class Loop(NamedTuple):
-    """The functions of a program that step environments; see `compiled_functions.Program`."""
+    """The functions that step environments; see `compiled_functions.Program`."""
 
-    begin: Callable[..., train_loop.State]
-    chunk: Callable[..., tuple[train_loop.State, Report]]
+    begin: Callable[..., train_loop.RunnerState]
+    chunk: Callable[..., tuple[train_loop.RunnerState, ChunkMetrics]]
     rollout: Callable[..., Rollout]
-    expect: Callable[..., train_loop.State]
+    state_shape: Callable[..., train_loop.RunnerState]
     traces: Callable[[], int]
 
 
@@ -51,17 +51,18 @@ class _Functions(NamedTuple):
       act: `(members, draws, number, acting, label, observation, steps) -> actions,
         label`, by the draw with that number; on the CPU, where it waits for no other
         device's updates.
-      absorb: `(members, learner, buffer, alive, index, time, played) -> learner,
-        buffer, alive, metrics`, stores `Shape.every` steps and makes the updates that
-        are due after them; what is given is used up, but for the learner with overlap.
+      store_and_update: `(members, learner, buffer, alive, index, time, played) ->
+        learner, buffer, alive, metrics`, stores `LoopConfig.every` steps and makes the
+        updates that are due after them; what is given is used up, but for the learner
+        with overlap.
       inspect: `(members, learner, buffer, index, time) -> metrics`.
     """
 
     roots: Callable[..., jax.Array]
-    begin: Callable[..., train_loop.State]
-    draws: Callable[..., exploration.Draw]
+    begin: Callable[..., train_loop.RunnerState]
+    draws: Callable[..., exploration.ActionNoise]
     act: Callable[..., tuple[jax.Array, Any]]
-    absorb: Callable[..., tuple[Any, Any, Any, Any]]
+    store_and_update: Callable[..., tuple[Any, Any, Any, Any]]
     inspect: Callable[..., dict[str, jax.Array]]
 
 
@@ -70,8 +71,8 @@ def loop(
     make: Callable[[Any], Method],
     act: Callable[..., Any],
     task_keys: Callable[[Any, Any], jax.Array],
-    begin: Callable[..., train_loop.State],
-    shape: Shape,
+    begin: Callable[..., train_loop.RunnerState],
+    shape: LoopConfig,
     mesh: Mesh,
 ) -> Loop:
     """The loop's functions.
@@ -86,7 +87,7 @@ def loop(
       mesh: the devices.
     """
     functions = _compile(environment, make, task_keys, begin, shape, mesh)
-    counted: list[Any] = [functions.act, functions.absorb]
+    counted: list[Any] = [functions.act, functions.store_and_update]
 
     def first(members, index, task):
         shaped = len(members.keys), shape.envs
@@ -102,7 +103,7 @@ def loop(
         episodes = population.place(first(members, index, task), mesh)
         return functions.begin(members, learner, alive, index, episodes)
 
-    def expect(members, learner, alive, index, task):
+    def state_shape(members, learner, alive, index, task):
         number = np.zeros((len(members.keys), shape.envs), np.int32)
         observation = np.zeros((*number.shape, environment.observation_size))
         episodes = host_episodes.begin(
@@ -114,7 +115,7 @@ def loop(
         begin=start,
         chunk=functools.partial(_chunk, environment, functions, shape, mesh),
         rollout=functools.partial(play, environment, shape.envs, act),
-        expect=expect,
+        state_shape=state_shape,
         traces=lambda: sum(function._cache_size() for function in counted),
     )
 
@@ -123,8 +124,8 @@ def _compile(
     environment: HostEnvironment,
     make: Callable[[Any], Method],
     task_keys: Callable[[Any, Any], jax.Array],
-    begin: Callable[..., train_loop.State],
-    shape: Shape,
+    begin: Callable[..., train_loop.RunnerState],
+    shape: LoopConfig,
     mesh: Mesh,
 ) -> _Functions:
     length, size = environment.episode_length, (shape.envs, environment.action_size)
@@ -139,7 +140,7 @@ def _compile(
             # All that a turn may touch, each drawn once.
             starts = time + length * jnp.arange((shape.every - 2) // length + 2)
             sequences = jax.vmap(
-                lambda start: exploration.draw_sequence(key, start, size, length, sac)
+                lambda start: exploration.sample_colored(key, start, size, length, sac)
             )(starts)
 
         def of(now):
@@ -147,7 +148,9 @@ def _compile(
             if sequences is not None:
                 sequence = sequences[now // length - time // length]
             collect_key, _ = jax.random.split(jax.random.fold_in(key, now))
-            return exploration.draw(collect_key, now, size, shape.random, sequence)
+            return exploration.sample_noise(
+                collect_key, now, size, shape.random, sequence
+            )
 
         return jax.vmap(of)(time + jnp.arange(shape.every))
 
@@ -159,7 +162,7 @@ def _compile(
 
         return jax.vmap(one)(members, draws, acting, label, observation, steps)
 
-    def absorb(member, learner, buffer, alive, index, time, played):
+    def store_and_update(member, learner, buffer, alive, index, time, played):
         def store(number, buffer):
             action, label, step = jax.tree.map(lambda leaf: leaf[number], played)
             at = time + number
@@ -168,19 +171,23 @@ def _compile(
         buffer = jax.lax.fori_loop(0, shape.every, store, buffer)
         done = time + shape.every
         key = jax.random.fold_in(task_keys(member, index)[1], done - 1)
-        state, metrics = train_loop.follow(
+        state, metrics = train_loop.update_from_buffer(
             jax.random.split(key)[1],
-            train_loop.State(learner, Collection(buffer, (), ()), alive),
+            train_loop.RunnerState(learner, CollectorState(buffer, (), ()), alive),
             done,
+            shape.before(done),
+            shape.due(done),
+            updates=shape.updates,
             environment=environment,
             method=make(member),
             settings=member.sac,
-            shape=shape,
         )
         return state.learner, buffer, state.alive, metrics
 
     def inspect(member, learner, buffer, index, time):
-        state = train_loop.State(learner, Collection(buffer, (), ()), jnp.asarray(True))
+        state = train_loop.RunnerState(
+            learner, CollectorState(buffer, (), ()), jnp.asarray(True)
+        )
         key, method = task_keys(member, index)[1], make(member)
         return train_loop.inspect(key, state, time, length, method, member.sac)
 
@@ -193,8 +200,16 @@ def _compile(
         # Called at each step, and so not through `shard_map`, which takes its time.
         act=jax.jit(act),
         # With overlap the former learner acts meanwhile, and must be left.
-        absorb=over(
-            absorb, 0, 0, 0, 0, None, None, 0, donate=(2,) if shape.overlap else (1, 2)
+        store_and_update=over(
+            store_and_update,
+            0,
+            0,
+            0,
+            0,
+            None,
+            None,
+            0,
+            donate=(2,) if shape.overlap else (1, 2),
         ),
         inspect=over(inspect, 0, 0, 0, None, None),
     )
@@ -203,22 +218,22 @@ def _compile(
 def _chunk(
     environment: HostEnvironment,
     functions: _Functions,
-    shape: Shape,
+    shape: LoopConfig,
     mesh: Mesh,
     members: Members,
-    state: train_loop.State,
+    state: train_loop.RunnerState,
     index: int,
     task: Task,
     time: int,
     steps: int,
-) -> tuple[train_loop.State, Report]:
-    """Collects and learns for some steps, a multiple of `Shape.every`."""
+) -> tuple[train_loop.RunnerState, ChunkMetrics]:
+    """Collects and learns for some steps, a multiple of `LoopConfig.every`."""
     assert steps % shape.every == 0
     learner, (buffer, episodes, label), alive, acting = state
     episodes = jax.tree.map(np.asarray, episodes)
     lanes = open_lanes(environment, episodes.steps.size)
     roots = np.asarray(functions.roots(members, index))
-    host_episodes.recall(lanes, task, roots, episodes, buffer, time)
+    host_episodes.replay_actions(lanes, task, roots, episodes, buffer, time)
     # What is asked for at each step must lie ready.
     task = jax.tree.map(np.asarray, task)
     cpu = jax.local_devices(backend="cpu")[0]
@@ -255,7 +270,14 @@ def _chunk(
                 metrics.append(values)
             before = learner
             learning = other.submit(
-                functions.absorb, members, learner, buffer, alive, index, start, along
+                functions.store_and_update,
+                members,
+                learner,
+                buffer,
+                alive,
+                index,
+                start,
+                along,
             )
             newest = before if shape.overlap else learning.result()[0]
             acting = here((newest.params, newest.memory))
@@ -267,15 +289,15 @@ def _chunk(
         inspected=functions.inspect(members, learner, buffer, index, end)
     )
     episodes, label = population.place((episodes, label), mesh)
-    return train_loop.State(
+    return train_loop.RunnerState(
         learner,
-        Collection(buffer, episodes, label),
+        CollectorState(buffer, episodes, label),
         alive,
         population.place(acting, mesh) if shape.overlap else (),
     ), report
 
 
-def _report(made: list[Step], metrics: Any, updates: int) -> Report:
+def _report(made: list[Step], metrics: Any, updates: int) -> ChunkMetrics:
     """What a chunk's steps `[members, every, envs]` each sum up to."""
     step = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *made)
     ended = step.terminal | step.truncated
@@ -283,7 +305,7 @@ def _report(made: list[Step], metrics: Any, updates: int) -> Report:
     def total(values):
         return np.sum(np.where(ended, values, 0), axis=(1, 2))
 
-    return Report(
+    return ChunkMetrics(
         episodes=total(1),
         returns=total(step.score),
         rewards=step.reward.mean(axis=2).sum(axis=1),

@@ -68,7 +68,7 @@ def _held(plan: Plan) -> tuple[Any, Any]:
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     fresh = jax.eval_shape(plan.program.init, plan.members)
     alive = jax.ShapeDtypeStruct((plan.places,), bool)
-    return fresh, plan.program.expect(plan.members, fresh, alive, 0, task)
+    return fresh, plan.program.state_shape(plan.members, fresh, alive, 0, task)
 
 
 def check(plan: Plan) -> None:
@@ -89,7 +89,7 @@ def need(plan: Plan) -> Need:
     fresh, state = _held(plan)
 
     def learn(member, state):
-        return train_loop.learn(
+        return train_loop.update_from_buffer(
             member.keys,
             state,
             jnp.asarray(1),

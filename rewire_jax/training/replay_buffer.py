@@ -117,7 +117,7 @@ def add(
     )
 
 
-def draw(
+def sample_indices(
     replay: Replay, key: jax.Array, time: jax.Array, shape: tuple[int, ...]
 ) -> jax.Array:
     """Places of transitions, uniform with replacement, as `take` takes them.
@@ -180,5 +180,7 @@ def _find(replay, places, time):
 def sample(
     replay: Replay, key: jax.Array, time: jax.Array, batch: int, episode_length: int
 ) -> Batch:
-    """`batch` transitions, uniform with replacement; see `draw` and `take`."""
-    return take(replay, draw(replay, key, time, (batch,)), time, episode_length)
+    """`batch` transitions, uniform with replacement, see `take`."""
+    return take(
+        replay, sample_indices(replay, key, time, (batch,)), time, episode_length
+    )

@@ -29,7 +29,7 @@ class Plan(NamedTuple):
       names: of these tasks.
       crowd: the members.
       steps: steps of all environments in a task.
-      polishing: after these, steps that only update from the buffer.
+      offline_steps: after these, steps that only update from the buffer.
       rows: places for candidates that are rolled out side by side; 0 where nothing is
         to be chosen.
       spec: sizes of the networks and of the sequence.
@@ -44,7 +44,7 @@ class Plan(NamedTuple):
     names: tuple[str, ...]
     crowd: tuple[Member, ...]
     steps: int
-    polishing: int
+    offline_steps: int
     rows: int
     spec: Spec
     members: Members
@@ -118,7 +118,7 @@ def prepare(
     )
     environment = scenario.environment
     spec = make_spec(settings, environment)
-    shape = train_loop.Shape(
+    shape = train_loop.LoopConfig(
         envs=settings.envs,
         updates=settings.updates,
         warmup=settings.warmup // settings.envs,
@@ -169,7 +169,9 @@ def prepare(
         names=tuple(task.name for task in sequence),
         crowd=tuple(crowd),
         steps=budget // round_ * settings.update_every,
-        polishing=-(-int(method.offline * settings.interactions) // settings.updates),
+        offline_steps=-(
+            -int(method.offline * settings.interactions) // settings.updates
+        ),
         rows=rows,
         spec=spec,
         members=members,

@@ -17,7 +17,7 @@ _ADAM = optax.scale_by_adam()
 _STATES = {"current": 1, "both": 2}  # of a transition, in the policy's losses
 
 
-class Learner(NamedTuple):
+class TrainState(NamedTuple):
     """All that learning changes.
 
     Attributes:
@@ -37,13 +37,13 @@ class Learner(NamedTuple):
     optimizers: tuple[Any, Any, Any]
 
 
-def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> Learner:
+def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainState:
     """A learner before its first task."""
     policy_key, critic_key = jax.random.split(key)
     params, memory = method.init(policy_key)
     critic = init_critic(critic_key, spec, method.extra)
     return restart(
-        Learner(params, memory, critic, critic, jnp.zeros(()), ((), (), ())), sac
+        TrainState(params, memory, critic, critic, jnp.zeros(()), ((), (), ())), sac
     )
 
 
@@ -54,7 +54,7 @@ def init_critic(key: jax.Array, spec: Spec, extra: int) -> Any:
     return jax.vmap(lambda k: networks.init_mlp(k, sizes))(jax.random.split(key))
 
 
-def restart(learner: Learner, sac: SacSettings) -> Learner:
+def restart(learner: TrainState, sac: SacSettings) -> TrainState:
     """Fresh optimisers, temperature and targets, as at the start of every task."""
     log_temperature = jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32))
     return learner._replace(
@@ -82,7 +82,7 @@ def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
     return jax.vmap(networks.mlp)(critic, jnp.stack([inputs, inputs]))[..., 0]
 
 
-class Draw(NamedTuple):
+class UpdateNoise(NamedTuple):
     """What an update leaves to chance.
 
     Attributes:
@@ -97,14 +97,14 @@ class Draw(NamedTuple):
     penalty: jax.Array
 
 
-def draw(
+def sample_noise(
     key: jax.Array,
     memory: Memory,
     label: Any,
     size: tuple[int, int],
     method: Method,
     sac: SacSettings,
-) -> Draw:
+) -> UpdateNoise:
     """A draw for one update.
 
     Args:
@@ -118,7 +118,7 @@ def draw(
     critic_key, policy_key, noise_key, penalty_key = jax.random.split(key, 4)
     states = _STATES[sac.policy_states]
     acting = jax.tree.map(lambda x: jnp.concatenate([x] * states), label)
-    return Draw(
+    return UpdateNoise(
         contexts=(
             method.context(critic_key, memory, "critic", label),
             method.context(policy_key, memory, "policy", acting),
@@ -206,7 +206,7 @@ def _update_policy(actor, learner, batch, draw, method, sac):
     ), metrics | {"temperature": temperature}
 
 
-def _actor(learner: Learner) -> _Actor:
+def _actor(learner: TrainState) -> _Actor:
     policy_state, _, temperature_state = learner.optimizers
     return _Actor(
         learner.params, learner.log_temperature, (policy_state, temperature_state)
@@ -220,7 +220,11 @@ def no_metrics(update: Callable[..., tuple[Any, Metrics]], *arguments: Any) -> M
 
 
 def first_metrics(
-    learner: Learner, batch: Batch, draw: Draw, method: Method, sac: SacSettings
+    learner: TrainState,
+    batch: Batch,
+    draw: UpdateNoise,
+    method: Method,
+    sac: SacSettings,
 ) -> Metrics:
     """What `update` is given before there was one; zeros."""
     policy = no_metrics(
@@ -237,14 +241,14 @@ def _every(delay, count, change, keep, value):
 
 
 def update(
-    learner: Learner,
+    learner: TrainState,
     metrics: Metrics,
     batch: Batch,
-    draw: Draw,
+    draw: UpdateNoise,
     count: jax.Array,
     method: Method,
     sac: SacSettings,
-) -> tuple[Learner, Metrics]:
+) -> tuple[TrainState, Metrics]:
     """One update of the critics and, in its turn, of policy and targets.
 
     Args:
@@ -292,14 +296,14 @@ def update(
 
 
 def updates(
-    learner: Learner,
-    draws: Draw,
+    learner: TrainState,
+    draws: UpdateNoise,
     batch: Callable[[jax.Array], Batch],
     first: jax.Array | int,
     count: jax.Array | int,
     method: Method,
     sac: SacSettings,
-) -> tuple[Learner, Metrics]:
+) -> tuple[TrainState, Metrics]:
     """Updates one after the other, and the last one's metrics.
 
     Args:

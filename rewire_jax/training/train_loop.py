@@ -12,7 +12,7 @@ from rewire_jax.methods.base import Method
 from rewire_jax.training import exploration, replay_buffer, rollout, sac
 
 
-class Shape(NamedTuple):
+class LoopConfig(NamedTuple):
     """Static sizes of the loop.
 
     Attributes:
@@ -43,7 +43,7 @@ class Shape(NamedTuple):
         return (steps // self.every - 1 - self.warmup // self.every) * self.updates
 
 
-class Collection(NamedTuple):
+class CollectorState(NamedTuple):
     """What collecting changes within a task.
 
     Attributes:
@@ -57,23 +57,23 @@ class Collection(NamedTuple):
     label: Any
 
 
-class State(NamedTuple):
+class RunnerState(NamedTuple):
     """A member in the middle of a task.
 
     Attributes:
       learner: all that learning changes.
       collection: all that collecting changes.
       alive: `[]` bool; once a value is not finite the learner is updated no more.
-      acting: parameters and memory that act next, with `Shape.overlap`; else `()`.
+      acting: parameters and memory that act next, with `LoopConfig.overlap`; else `()`.
     """
 
-    learner: sac.Learner
-    collection: Collection
+    learner: sac.TrainState
+    collection: CollectorState
     alive: jax.Array
     acting: Any = ()
 
 
-class Report(NamedTuple):
+class ChunkMetrics(NamedTuple):
     """What happened in a chunk.
 
     Attributes:
@@ -110,19 +110,19 @@ def all_finite(tree: Any) -> jax.Array:
 
 def collect(
     key: jax.Array,
-    state: State,
+    state: RunnerState,
     task: Task,
     time: jax.Array,
     environment: Environment,
     method: Method,
-    shape: Shape,
+    shape: LoopConfig,
     sequence: jax.Array | None,
-) -> tuple[Collection, rollout.Step]:
+) -> tuple[CollectorState, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
     learner, (buffer, episodes, label), *_ = state
     size = shape.envs, environment.action_size
     action, label = exploration.explore(
-        exploration.draw(key, time, size, shape.random, sequence),
+        exploration.sample_noise(key, time, size, shape.random, sequence),
         (learner.params, learner.memory),
         label,
         episodes.state.observation,
@@ -142,7 +142,7 @@ def collect(
     advance = functools.partial(rollout.advance, environment, task)
     episodes, step = jax.vmap(advance)(episodes, action)
     buffer = store(buffer, time, action, label, step, length)
-    return Collection(buffer, episodes, label), step
+    return CollectorState(buffer, episodes, label), step
 
 
 def store(
@@ -168,9 +168,9 @@ def store(
     )
 
 
-def learn(
+def update_from_buffer(
     key: jax.Array,
-    state: State,
+    state: RunnerState,
     time: jax.Array,
     first: jax.Array,
     due: jax.Array | bool,
@@ -179,7 +179,7 @@ def learn(
     environment: Environment | HostEnvironment,
     method: Method,
     settings: SacSettings,
-) -> tuple[State, sac.Metrics]:
+) -> tuple[RunnerState, sac.Metrics]:
     """Updates from a member's buffer, and the last one's metrics.
 
     All that they leave to chance is drawn before the first: many small draws would
@@ -201,9 +201,11 @@ def learn(
 
     def learned(learner):
         places_key, draw_key = jax.random.split(key)
-        places = replay_buffer.draw(buffer, places_key, time, (updates, size[0]))
+        places = replay_buffer.sample_indices(
+            buffer, places_key, time, (updates, size[0])
+        )
         draws = jax.vmap(
-            lambda key, label: sac.draw(
+            lambda key, label: sac.sample_noise(
                 key, learner.memory, label, size, method, settings
             )
         )(
@@ -230,33 +232,9 @@ def learn(
     return state._replace(learner=learner, alive=alive), metrics
 
 
-def follow(
-    key: jax.Array,
-    state: State,
-    steps: jax.Array,
-    *,
-    environment: Environment | HostEnvironment,
-    method: Method,
-    settings: SacSettings,
-    shape: Shape,
-) -> tuple[State, sac.Metrics]:
-    """The updates that are due after so many steps of a task, as in `learn`."""
-    return learn(
-        key,
-        state,
-        steps,
-        shape.before(steps),
-        shape.due(steps),
-        updates=shape.updates,
-        environment=environment,
-        method=method,
-        settings=settings,
-    )
-
-
 def train(
     key: jax.Array,
-    state: State,
+    state: RunnerState,
     task: Task,
     time: jax.Array,
     steps: jax.Array,
@@ -264,8 +242,8 @@ def train(
     environment: Environment,
     method: Method,
     settings: SacSettings,
-    shape: Shape,
-) -> tuple[State, Report]:
+    shape: LoopConfig,
+) -> tuple[RunnerState, ChunkMetrics]:
     """Collects and learns for some steps; one member.
 
     Args:
@@ -284,14 +262,16 @@ def train(
     size = shape.envs, environment.action_size
 
     def update(key, state, done):
-        return follow(
+        return update_from_buffer(
             key,
             state,
             done,
+            shape.before(done),
+            shape.due(done),
+            updates=shape.updates,
             environment=environment,
             method=method,
             settings=settings,
-            shape=shape,
         )
 
     def step(index, carry):
@@ -300,7 +280,7 @@ def train(
             # It is not part of the state: a chunk draws it anew.
             sequence = jax.lax.cond(
                 (index % length == 0) | (index == time),
-                lambda: exploration.draw_sequence(key, index, size, length, settings),
+                lambda: exploration.sample_colored(key, index, size, length, settings),
                 lambda: sequence,
             )
         collect_key, update_key = jax.random.split(jax.random.fold_in(key, index))
@@ -310,7 +290,7 @@ def train(
         state = state._replace(collection=collection)
         state, metrics = update(update_key, state, index + 1)
         ended = stepped.terminal | stepped.truncated
-        report = Report(
+        report = ChunkMetrics(
             report.episodes + jnp.sum(ended),
             report.returns + jnp.sum(jnp.where(ended, stepped.score, 0.0)),
             report.rewards + jnp.mean(stepped.reward),
@@ -326,7 +306,7 @@ def train(
         return state, report, sequence
 
     none = jnp.zeros(())
-    report = Report(
+    report = ChunkMetrics(
         jnp.zeros((), jnp.int32),
         none,
         none,
@@ -347,7 +327,7 @@ def train(
 
 def inspect(
     key: jax.Array,
-    state: State,
+    state: RunnerState,
     time: jax.Array,
     length: int,
     method: Method,

@@ -163,7 +163,7 @@ def bare_success(name, seed, horizon):
 
 @pytest.mark.parametrize("name", ["window-close", "faucet-close", "handle-press-side"])
 def test_experts_solve_quick_tasks(name):
-    vector = vector_env.Lanes(environment(), 1)
+    vector = vector_env.VectorEnv(environment(), 1)
     for seed in range(2):
         (ours,) = first_successes(vector, name, [seed], 200)
         assert ours is not None
@@ -175,7 +175,7 @@ def pair():
     """Two simulators in processes of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(vector_env, "_cores", lambda: 2)
-        return vector_env.Lanes(environment(), 2)
+        return vector_env.VectorEnv(environment(), 2)
 
 
 @pytest.mark.slow

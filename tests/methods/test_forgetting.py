@@ -188,7 +188,7 @@ def test_one_trace_for_all_tasks(
     assert counts.pop("evaluation") <= 1
     assert counts.pop("selection") <= 1
     # Only PackNet updates after its interactions.
-    assert counts.pop("polish") == (method == "packnet")
+    assert counts.pop("offline_update") == (method == "packnet")
     assert counts == dict.fromkeys(counts, 1)
     assert ("consolidate" in counts) == (method in ("ewc", "packnet", "csp"))
     assert ("candidates" in counts) == (method in ("rewire", "csp"))
@@ -220,8 +220,8 @@ def short(method: str, seed: int, seeds: int):
         if program.consolidate:
             learner = program.consolidate(members, state, index, 24)
             state = state._replace(learner=learner)
-        if prepared.polishing:
-            state = program.polish(members, state, index, 24, 0, 2)
+        if prepared.offline_steps:
+            state = program.offline_update(members, state, index, 24, 0, 2)
         learner = program.finish(members, state.learner, index, None)
     return learner, reports, program.policies(members, learner)
 

@@ -144,7 +144,11 @@ def killing(monkeypatch: pytest.MonkeyPatch, name: str, times: int) -> None:
 # and its checkpoint; between PackNet's last interactions and the evaluation.
 @pytest.mark.parametrize(
     ("method", "name", "times"),
-    [("rewire", "chunk", 7), ("rewire", "evaluate", 3), ("packnet", "polish", 2)],
+    [
+        ("rewire", "chunk", 7),
+        ("rewire", "evaluate", 3),
+        ("packnet", "offline_update", 2),
+    ],
 )
 def test_nothing_is_there_twice_and_nothing_missing_after_a_kill(
     method: str,

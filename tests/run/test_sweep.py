@@ -293,7 +293,8 @@ def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
     traces = {
         name: function._cache_size()
         for name, function in program._asdict().items()
-        if hasattr(function, "_cache_size") and name not in ("consolidate", "polish")
+        if hasattr(function, "_cache_size")
+        and name not in ("consolidate", "offline_update")
     }
     assert traces == dict.fromkeys(traces, 1)
     assert "chunk" in traces

@@ -130,7 +130,7 @@ def stop_after(
 @pytest.mark.parametrize(
     ("method", "times", "name", "resumed"),
     [
-        ("packnet", 3, "polish", "task-001-step-0000040"),
+        ("packnet", 3, "offline_update", "task-001-step-0000040"),
         ("csp", 5, "chunk", "task-001-step-0000020"),
     ],
 )
@@ -226,10 +226,10 @@ def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
         "rollout",
         "trial",
         "baseline",
-        "expect",
+        "state_shape",
         "traces",
         "consolidate",
-        "polish",
+        "offline_update",
     )
     program = prepared.program._asdict()
     program = {name: f for name, f in program.items() if name not in others}

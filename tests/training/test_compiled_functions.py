@@ -78,7 +78,7 @@ def state(plan):
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     learner = jax.eval_shape(plan.program.init, plan.members)
     alive = jax.ShapeDtypeStruct((plan.places,), bool)
-    return plan.program.expect(plan.members, learner, alive, 0, task)
+    return plan.program.state_shape(plan.members, learner, alive, 0, task)
 
 
 @pytest.fixture(scope="module")

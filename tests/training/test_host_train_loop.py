@@ -18,7 +18,7 @@ import pytest
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import HostEnvironment
-from rewire_jax.envs.vector_env import Lanes, open_lanes
+from rewire_jax.envs.vector_env import VectorEnv, open_lanes
 from rewire_jax.methods import find_method
 from rewire_jax.run import train_run
 from rewire_jax.training import exploration, host_episodes, train_loop
@@ -109,7 +109,7 @@ def test_the_loop_does_what_the_compiled_one_does(method, color):
     assert ours_reports[1].episodes >= 2
     assert abs(ours.collection.buffer.reward).sum() > 1
     for plan, (state, _) in zip(plans, results, strict=True):
-        expected = plan.program.expect(
+        expected = plan.program.state_shape(
             plan.members,
             jax.eval_shape(plan.program.init, plan.members),
             np.ones(1, bool),
@@ -248,7 +248,7 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
     def acted(learner, time):
         step_key = jax.random.split(jax.random.fold_in(key[1], time))[0]
         action, _ = exploration.explore(
-            exploration.draw(step_key, jnp.asarray(time), (1, 2), 0, None),
+            exploration.sample_noise(step_key, jnp.asarray(time), (1, 2), 0, None),
             jax.tree.map(lambda x: x[0], (learner.params, learner.memory)),
             (),
             final.observation[0, time],
@@ -275,7 +275,7 @@ def test_with_overlap_steps_and_updates_are_made_at_the_same_time(monkeypatch):
     state = begin(plan)
     state, _ = go(plan, state, [8])  # all is compiled
     submitted, stepped = [], []
-    submit, step = ThreadPoolExecutor.submit, Lanes.step
+    submit, step = ThreadPoolExecutor.submit, VectorEnv.step
     held = threading.Event()
 
     def slow_submit(self, function, *arguments):
@@ -295,7 +295,7 @@ def test_with_overlap_steps_and_updates_are_made_at_the_same_time(monkeypatch):
         return step(self, actions)
 
     monkeypatch.setattr(ThreadPoolExecutor, "submit", slow_submit)
-    monkeypatch.setattr(Lanes, "step", counted)
+    monkeypatch.setattr(VectorEnv, "step", counted)
     threading.Timer(30, held.set).start()
     began = time.monotonic()
     done = threading.Thread(target=go, args=(plan, state, [12]), kwargs={"time": 8})
@@ -445,7 +445,9 @@ def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():
 
 
 def test_updates_follow_every_so_many_steps():
-    shape = train_loop.Shape(1, updates=7, warmup=10, random=0, transitions=9, every=4)
+    shape = train_loop.LoopConfig(
+        1, updates=7, warmup=10, random=0, transitions=9, every=4
+    )
     due = [steps for steps in range(1, 30) if shape.due(steps)]
     assert due == [12, 16, 20, 24, 28]
     assert [shape.before(steps) for steps in due] == [0, 7, 14, 21, 28]
@@ -469,7 +471,7 @@ def test_seeds_are_told_apart():
 
 
 def test_lanes_that_are_not_reset_go_on():
-    lanes = Lanes(walk.walker(0.5), 1)
+    lanes = VectorEnv(walk.walker(0.5), 1)
     lanes.reset(0, [4])
     first = lanes.step(np.zeros((1, 2), np.float32))
     assert isinstance(walk.walker(), HostEnvironment)

@@ -57,7 +57,7 @@ def update(learner, metrics, batch, count, settings):
 
 def drawn(batch, settings):
     size = batch.action.shape
-    return sac.draw(jax.random.key(1), (), (), size, METHOD, settings)
+    return sac.sample_noise(jax.random.key(1), (), (), size, METHOD, settings)
 
 
 @pytest.fixture(autouse=True)
@@ -335,7 +335,9 @@ def test_probe_values_and_actions_are_learned(time_limit):
     )
     entry = find_method("ft1")
     method = entry.make(spec, entry.preset("", 1, "paper"))
-    shape = train_loop.Shape(envs=8, updates=4, warmup=12, random=100, transitions=300)
+    shape = train_loop.LoopConfig(
+        envs=8, updates=4, warmup=12, random=100, transitions=300
+    )
     steps = 300
 
     @jax.jit
@@ -351,8 +353,8 @@ def test_probe_values_and_actions_are_learned(time_limit):
                 actions=1,
                 episode_length=environment.episode_length,
             )
-            collection = train_loop.Collection(buffer, episodes, ())
-            return train_loop.State(learner, collection, jnp.asarray(True))
+            collection = train_loop.CollectorState(buffer, episodes, ())
+            return train_loop.RunnerState(learner, collection, jnp.asarray(True))
 
         def train(key, state, task):
             return train_loop.train(

@@ -19,7 +19,7 @@ TASKS = [task.data for task in SCENARIO.tasks]
 # A width that no other test has, so that its traces are counted here alone.
 SPEC = Spec(observations=2, actions=2, hidden=18, depth=1, tasks=len(TASKS))
 WARMUP, RANDOM = 5, 12
-SHAPE = train_loop.Shape(
+SHAPE = train_loop.LoopConfig(
     envs=4, updates=3, warmup=WARMUP, random=RANDOM, transitions=16
 )
 PLAIN = SacSettings(
@@ -330,7 +330,7 @@ def sequence(method, tasks):
     functions = {
         name: function
         for name, function in program._asdict().items()
-        if hasattr(function, "_cache_size") and name != "polish"
+        if hasattr(function, "_cache_size") and name != "offline_update"
     }
     learner, alive = program.init(members), np.ones(4, bool)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *TASKS)
