@@ -56,9 +56,9 @@ class Loop:
         """Begins the first task and makes its first updates."""
         self.plan = plan
         self.task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-        learner = plan.program.init(plan.members)
-        alive = np.ones(plan.places, bool)
-        self.state = plan.program.begin(plan.members, learner, alive, 0, self.task)
+        learner = plan.program.init(plan.stacked)
+        active = np.ones(plan.num_slots, bool)
+        self.state = plan.program.begin(plan.stacked, learner, active, 0, self.task)
         self.time = 0
         settings = plan.settings
         self.steps(-(-settings.warmup // settings.update_every) + 1)
@@ -68,7 +68,7 @@ class Loop:
         """Steps and updates."""
         steps = times * self.plan.settings.update_every
         self.state, _ = self.plan.program.chunk(
-            self.plan.members, self.state, 0, self.task, self.time, steps
+            self.plan.stacked, self.state, 0, self.task, self.time, steps
         )
         jax.block_until_ready(self.state)
         self.time += steps
@@ -76,7 +76,7 @@ class Loop:
     def updates(self, times: int) -> None:
         """Updates alone."""
         self.state = self.plan.program.offline_update(
-            self.plan.members, self.state, 0, self.time, 0, times
+            self.plan.stacked, self.state, 0, self.time, 0, times
         )
         jax.block_until_ready(self.state)
 

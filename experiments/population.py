@@ -68,22 +68,22 @@ def measure(job: Population, members: int) -> dict[str, Any]:
     scenario = rewire_jax.make_scenario(job.scenario)
     settings = rewire_jax.preset(scenario, job.method, job.profile)
     plan = prepare(replace(settings, seeds=members), scenario)
-    program, crowd = plan.program, plan.members
+    program, stacked = plan.program, plan.stacked
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-    alive = jnp.ones(members, bool)
-    state = program.begin(crowd, program.init(crowd), alive, 0, task)
+    active = jnp.ones(members, bool)
+    state = program.begin(stacked, program.init(stacked), active, 0, task)
     began, used = time.perf_counter(), time.process_time()
-    lowered = program.chunk.lower(crowd, state, 0, task, 0, 1)  # type: ignore
+    lowered = program.chunk.lower(stacked, state, 0, task, 0, 1)  # type: ignore
     chunk = lowered.compile()
     compiling = time.perf_counter() - began, time.process_time() - used
     # Up to where updates begin.
     done = settings.warmup // settings.envs
-    state, _ = chunk(crowd, state, 0, task, 0, done)
+    state, _ = chunk(stacked, state, 0, task, 0, done)
     rounds = []
     for _ in range(job.rounds):
         jax.block_until_ready(state)
         began, used = time.perf_counter(), time.process_time()
-        state, _ = chunk(crowd, state, 0, task, done, job.steps)
+        state, _ = chunk(stacked, state, 0, task, done, job.steps)
         jax.block_until_ready(state)
         rounds.append((time.perf_counter() - began, time.process_time() - used))
         done += job.steps

@@ -99,15 +99,15 @@ def assert_same(actual, expected):
 
 
 def after_tasks(method, number, rng, **kept):
-    """Parameters and memory after some tasks of random learning."""
-    params, memory = method.init(KEY)
+    """Parameters and state after some tasks of random learning."""
+    params, state = method.init(KEY)
     for task in range(number):
-        params, memory = method.start_task(KEY, params, memory, task)
+        params, state = method.start_task(KEY, params, state, task)
         params = trained(rng, params, task % SLOTS, **kept)
         places = params.scores.shape[0]
         rank = selection(rng.permutation(places) + 1.0)
-        params, memory = method.end_task(params, memory, task, rank)
-    return params, memory
+        params, state = method.end_task(params, state, task, rank)
+    return params, state
 
 
 def evenly_in(orders):

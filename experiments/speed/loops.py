@@ -72,12 +72,12 @@ def version(package: str) -> str | None:
 def whole_loop(settings: Settings) -> Loop:
     """Steps of all our environments with all their updates, in a second task."""
     plan = prepare(settings)
-    program, members = plan.program, plan.members
+    program, members = plan.program, plan.stacked
     first, second = (jax.tree.map(lambda x, i=i: x[i], plan.tasks) for i in range(2))
-    alive = np.ones(plan.places, bool)
-    state = program.begin(members, program.init(members), alive, 0, first)
+    active = np.ones(plan.num_slots, bool)
+    state = program.begin(members, program.init(members), active, 0, first)
     learner = program.finish(members, state.learner, 0, None)
-    state = program.begin(members, learner, alive, 1, second)
+    state = program.begin(members, learner, active, 1, second)
     done = 0
 
     def loop(count):

@@ -41,9 +41,9 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
     def begin(member):
         method = make(spec, member.options)
         learner = sac.init(member.keys, method, spec, member.sac)
-        kept = method.end_task(learner.params, learner.memory, 0, None)
-        params, memory = method.start_task(member.keys, *kept, 1)
-        learner = learner._replace(params=params, memory=memory)
+        kept = method.end_task(learner.params, learner.method_state, 0, None)
+        params, method_state = method.start_task(member.keys, *kept, 1)
+        learner = learner._replace(params=params, method_state=method_state)
         return member, sac.restart(learner, member.sac)
 
     def advance(state, batches, count):
@@ -55,7 +55,9 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
             return jax.tree.map(lambda x: x[number], batches)
 
         def draw(key):
-            return sac.sample_noise(key, learner.memory, (), size, method, member.sac)
+            return sac.sample_noise(
+                key, learner.method_state, (), size, method, member.sac
+            )
 
         def several(number, learner):
             key, first = jax.random.fold_in(member.keys, number), number * drawn
@@ -66,7 +68,7 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
 
         return member, jax.lax.fori_loop(0, -(-count // drawn), several, learner)
 
-    state = jax.jit(jax.vmap(begin))(plan.members)
+    state = jax.jit(jax.vmap(begin))(plan.stacked)
     batches = draw_batches(spec, settings.sac.batch_size)
     return state, jax.vmap(advance, (0, None, None)), batches
 

@@ -14,4 +14,4 @@ class Batch(NamedTuple):
     terminal: jax.Array
     truncated: jax.Array
     next_observation: jax.Array
-    label: Any = ()
+    extras: Any = ()

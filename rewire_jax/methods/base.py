@@ -11,9 +11,9 @@ from rewire_jax.core.transition import Batch
 
 Params = Any
 """Pytree that the policy's optimiser trains."""
-Memory = Any
+MethodState = Any
 """Pytree that a method carries from task to task, with its slots from the start."""
-Label = Any
+Extras = Any
 """Pytree that a method stores with each transition."""
 Context = Any
 """Pytree of what a method draws for one update or one acting step."""
@@ -116,77 +116,81 @@ class Method(NamedTuple):
     the index in the sequence. Only the first five are needed.
 
     Attributes:
-      init: `key -> params, memory`, before the first task.
-      distribution: `(params, memory, context, observation) -> mean, log_std` of
+      init: `key -> params, state`, before the first task.
+      distribution: `(params, state, context, observation) -> mean, log_std` of
         the Gaussian before the squashing; observation `[..., observations]`.
-      policy: `(params, memory, task) -> policy` for a task of the sequence, after
+      policy: `(params, state, task) -> policy` for a task of the sequence, after
         any number of finished tasks; one not yet seen gets the latest policy, or
         the one that the method knows to belong to it.
       act: `(policy, observation) -> mean, log_std`; a plain function, the same
         object for all members.
-      size: `(params, memory) -> []`, the numbers stored for all policies.
-      start_task: `(key, params, memory, task) -> params, memory`. Optimisers and
+      size: `(params, state) -> []`, the numbers stored for all policies.
+      start_task: `(key, params, state, task) -> params, state`. Optimisers and
         temperature start anew by themselves.
-      label: `(key, memory, label, steps) -> label [envs, ...]`, stored with the
+      extras: `(key, state, extras, steps) -> extras [envs, ...]`, stored with the
         transitions of a step. `steps` `[envs]` counts those of the running
-        episodes; `label` is that of the step before, None in a task's first.
-      context: `(key, memory, purpose, label) -> context`, drawn for each update
-        and each acting step; `label` `[batch, ...]` is that of the transitions.
-      penalty: `(key, params, memory, context, observation, (mean, log_std)) ->
+        episodes; `extras` is that of the step before, None in a task's first.
+      context: `(key, state, purpose, extras) -> context`, drawn for each update
+        and each acting step; `extras` `[batch, ...]` is that of the transitions.
+      penalty: `(key, params, state, context, observation, (mean, log_std)) ->
         loss, metrics`, added to SAC's policy loss; the pair is what
         `distribution` gave for the same arguments.
-      inspect: `(params, memory, observation) -> metrics`, computed from a batch once
+      inspect: `(params, state, observation) -> metrics`, computed from a batch once
         a progress report.
-      adjust_updates: `(updates, memory) -> updates`, after the optimiser.
-      critic_input: `(context, observation) -> [..., observations + extra]`, what
-        the critics see beside the action; of a stored transition its label is given
-        as the context.
-      extra: numbers in it beyond the observation.
+      adjust_updates: `(updates, state) -> updates`, after the optimiser.
+      critic_input: `(context, observation) -> [..., observations + critic_extra]`,
+        what the critics see beside the action; of a stored transition its extras are
+        given as the context.
+      critic_extra: numbers in it beyond the observation.
       fresh_critic: whether the critics, too, start anew with each task.
-      consolidate: `(key, params, memory, task, tools) -> params, memory`, when a
+      consolidate: `(key, params, state, task, tools) -> params, state`, when a
         task's interactions are over; or None.
       offline: updates from the buffer after that, a share of the interactions. They
         begin with fresh optimisers and temperature, and need `consolidate`.
       offline_sac: SAC's settings for these, from those of the run.
-      candidates: `(params, memory, task) -> Candidates`, rolled out at the end of
+      candidates: `(params, state, task) -> Candidates`, rolled out at the end of
         each task, or None where nothing is to be chosen.
       baseline: whether they are rolled out at a task's start, too.
       in_budget: whether these interactions are part of the task's own.
       candidate_score: what a candidate is judged by: the return of its "episode", or,
         after as many steps as an episode has, that "since_reset", the latest reset.
-      end_task: `(params, memory, task, Selection or None) -> params, memory`.
+      end_task: `(params, state, task, Selection or None) -> params, state`.
     """
 
-    init: Callable[[jax.Array], tuple[Params, Memory]]
+    init: Callable[[jax.Array], tuple[Params, MethodState]]
     distribution: Callable[..., tuple[jax.Array, jax.Array]]
-    policy: Callable[[Params, Memory, jax.Array], Policy]
+    policy: Callable[[Params, MethodState, jax.Array], Policy]
     act: Callable[[Policy, jax.Array], tuple[jax.Array, jax.Array]]
-    size: Callable[[Params, Memory], jax.Array]
-    start_task: Callable[..., tuple[Params, Memory]] = (
-        lambda key, params, memory, task: (params, memory)
+    size: Callable[[Params, MethodState], jax.Array]
+    start_task: Callable[..., tuple[Params, MethodState]] = (
+        lambda key, params, state, task: (params, state)
     )
-    label: Callable[[jax.Array, Memory, Label, jax.Array], Label] = lambda *_: ()
-    context: Callable[[jax.Array, Memory, Purpose, Label], Context] = lambda *_: ()
+    extras: Callable[..., Extras] = lambda *_: ()
+    context: Callable[..., Context] = lambda *_: ()
     penalty: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] = lambda *_: (
         jnp.zeros(()),
         {},
     )
-    inspect: Callable[[Params, Memory, jax.Array], dict[str, jax.Array]] = lambda *_: {}
-    adjust_updates: Callable[[Params, Memory], Params] = lambda updates, memory: updates
+    inspect: Callable[[Params, MethodState, jax.Array], dict[str, jax.Array]] = (
+        lambda *_: {}
+    )
+    adjust_updates: Callable[[Params, MethodState], Params] = lambda updates, state: (
+        updates
+    )
     critic_input: Callable[[Context, jax.Array], jax.Array] = (
         lambda context, observation: observation
     )
-    extra: int = 0
+    critic_extra: int = 0
     fresh_critic: bool = False
-    consolidate: Callable[..., tuple[Params, Memory]] | None = None
+    consolidate: Callable[..., tuple[Params, MethodState]] | None = None
     offline: float = 0.0
     offline_sac: Callable[[SacSettings], SacSettings] = lambda sac: sac
-    candidates: Callable[[Params, Memory, jax.Array], Candidates] | None = None
+    candidates: Callable[[Params, MethodState, jax.Array], Candidates] | None = None
     baseline: bool = False
     in_budget: bool = False
     candidate_score: CandidateScore = "episode"
-    end_task: Callable[..., tuple[Params, Memory]] = (
-        lambda params, memory, task, selection: (params, memory)
+    end_task: Callable[..., tuple[Params, MethodState]] = (
+        lambda params, state, task, selection: (params, state)
     )
 
 

@@ -114,7 +114,7 @@ def preset(scenario: str, period: int, profile: str) -> CspSettings:
     return options
 
 
-class Memory(NamedTuple):
+class State(NamedTuple):
     """What is kept from task to task.
 
     Attributes:
@@ -147,7 +147,7 @@ def csp(spec: Spec, options: CspSettings) -> Method:
 
     def init(key):
         params = networks.init_mlp(key, spec.sizes(options.width))
-        return params, Memory(
+        return params, State(
             learned=jnp.zeros((), jnp.int32),
             frozen=jnp.zeros((), jnp.int32),
             anchors=tile(jax.tree.map(jnp.zeros_like, params), slots),
@@ -155,63 +155,63 @@ def csp(spec: Spec, options: CspSettings) -> Method:
             proposals=jnp.zeros((options.rollouts, slots)),
         )
 
-    def from_former(key, memory, shape):
+    def from_former(key, state, shape):
         # Before there is a frozen anchor, all weight is on the first.
-        return dirichlet(key, slots, jnp.maximum(memory.frozen, 1), shape)
+        return dirichlet(key, slots, jnp.maximum(state.frozen, 1), shape)
 
-    def from_new(key, memory, shape):
-        anchors = memory.frozen + 1
+    def from_new(key, state, shape):
+        anchors = state.frozen + 1
         last = anchors**2 if options.distribution == "peaked" else None
         return dirichlet(key, slots, anchors, shape, last)
 
-    def label(key, memory, label, steps):
+    def extras(key, state, extras, steps):
         new_key, former_key = jax.random.split(key)
         in_new = jnp.arange(steps.size) < (steps.size + 1) // 2
         drawn = jnp.where(
             in_new[:, None],
-            from_new(new_key, memory, steps.shape),
-            from_former(former_key, memory, steps.shape),
+            from_new(new_key, state, steps.shape),
+            from_former(former_key, state, steps.shape),
         )
-        if label is None:
+        if extras is None:
             return drawn
         # An episode's first step, number 0, is among these.
         due = steps % options.resample_every == 0
-        return jnp.where(due[:, None], drawn, label)
+        return jnp.where(due[:, None], drawn, extras)
 
-    def context(key, memory, purpose, label):
+    def context(key, state, purpose, extras):
         # As in the paper, Q is that of the policy with the stored weights, now and in
         # the next state.
         redrawn = purpose == "critic" and options.next_weights == "redrawn"
         if purpose == "policy" or redrawn:
-            return from_new(key, memory, label.shape[:-1])
-        return label
+            return from_new(key, state, extras.shape[:-1])
+        return extras
 
-    def distribution(params, memory, context, observation):
-        newest = context[..., memory.frozen, None]
+    def distribution(params, state, context, observation):
+        newest = context[..., state.frozen, None]
         x = observation
         for index, layer in enumerate(params):
             x = networks.activate(x) if index else x
             # A layer is linear in its numbers, so that its outputs can be mixed.
-            frozen = memory.anchors[index]
+            frozen = state.anchors[index]
             outputs = jnp.einsum("...i,aoi->...ao", x, frozen.weight) + frozen.bias
             mixed = jnp.sum(context[..., None] * outputs, axis=-2)
             x = mixed + newest * networks.affine(layer, x)
         return networks.gaussian(x)
 
-    def with_newest(params, memory):
-        return put(memory.anchors, memory.frozen, params)
+    def with_newest(params, state):
+        return put(state.anchors, state.frozen, params)
 
     def critic_input(context, observation):
         return jnp.concatenate([observation, context], axis=-1)
 
-    def consolidate(key, params, memory, task, tools):
+    def consolidate(key, params, state, task, tools):
         del task
         samples = options.samples
         new_key, former_key, key = jax.random.split(key, 3)
         weights = jnp.concatenate(
             [
-                dirichlet(new_key, slots, memory.frozen + 1, (samples,)),
-                from_former(former_key, memory, (samples,)),
+                dirichlet(new_key, slots, state.frozen + 1, (samples,)),
+                from_former(former_key, state, (samples,)),
             ]
         )
 
@@ -224,17 +224,17 @@ def csp(spec: Spec, options: CspSettings) -> Method:
         total, _ = jax.lax.scan(estimate, jnp.zeros(2 * samples), keys)
         _, top = jax.lax.top_k(total.reshape(2, samples), half)
         chosen = top + samples * jnp.arange(2)[:, None]
-        return params, memory._replace(proposals=weights[chosen.reshape(-1)])
+        return params, state._replace(proposals=weights[chosen.reshape(-1)])
 
-    def candidates(params, memory, task):
+    def candidates(params, state, task):
         del task
-        anchors = with_newest(params, memory)
-        policies = jax.vmap(fold, (None, 0))(anchors, memory.proposals)
-        several = jnp.broadcast_to(memory.frozen > 0, options.rollouts)
+        anchors = with_newest(params, state)
+        policies = jax.vmap(fold, (None, 0))(anchors, state.proposals)
+        several = jnp.broadcast_to(state.frozen > 0, options.rollouts)
         return Candidates(policies, several)
 
-    def end_task(params, memory, task, selection):
-        weights = jnp.where(slot == memory.frozen, 1.0, 0.0)
+    def end_task(params, state, task, selection):
+        weights = jnp.where(slot == state.frozen, 1.0, 0.0)
         kept = jnp.asarray(True)
         if selection is not None:
             # A return that is not a number must not win, as it would in argmax.
@@ -242,35 +242,35 @@ def csp(spec: Spec, options: CspSettings) -> Method:
             returns = jnp.where(failed, -jnp.inf, selection.after).reshape(2, half)
             new, former = jnp.max(returns, axis=1)
             better = new > (1 + options.improvement) * former
-            first = memory.frozen == 0
+            first = state.frozen == 0
             kept = first | better
             winner = jnp.argmax(returns, axis=1)
             chosen = jnp.where(better, winner[0], half + winner[1])
-            weights = jnp.where(first, weights, memory.proposals[chosen])
+            weights = jnp.where(first, weights, state.proposals[chosen])
         anchors = jax.tree.map(
             lambda a, b: jnp.where(kept, a, b),
-            with_newest(params, memory),
-            memory.anchors,
+            with_newest(params, state),
+            state.anchors,
         )
-        frozen = memory.frozen + kept
+        frozen = state.frozen + kept
         # The next anchor starts as the mean of the frozen ones.
-        return fold(anchors, (slot < frozen) / frozen), memory._replace(
-            learned=memory.learned + 1,
+        return fold(anchors, (slot < frozen) / frozen), state._replace(
+            learned=state.learned + 1,
             frozen=frozen,
             anchors=anchors,
-            best=memory.best.at[task].set(weights),
+            best=state.best.at[task].set(weights),
         )
 
-    def policy(params, memory, task):
-        latest = jnp.maximum(memory.learned - 1, 0)
-        folded = fold(memory.anchors, memory.best[jnp.minimum(task, latest)])
+    def policy(params, state, task):
+        latest = jnp.maximum(state.learned - 1, 0)
+        folded = fold(state.anchors, state.best[jnp.minimum(task, latest)])
         return jax.tree.map(
-            lambda a, b: jnp.where(memory.learned > 0, a, b), folded, params
+            lambda a, b: jnp.where(state.learned > 0, a, b), folded, params
         )
 
-    def size(params, memory):
+    def size(params, state):
         # As in the authors' code, the tasks' few weights are not counted.
-        return jnp.maximum(memory.frozen, 1) * count(params)
+        return jnp.maximum(state.frozen, 1) * count(params)
 
     return Method(
         init=init,
@@ -278,10 +278,10 @@ def csp(spec: Spec, options: CspSettings) -> Method:
         policy=policy,
         act=networks.mlp_policy,
         size=size,
-        label=label,
+        extras=extras,
         context=context,
         critic_input=critic_input,
-        extra=slots,
+        critic_extra=slots,
         fresh_critic=True,
         consolidate=consolidate,
         candidates=candidates,

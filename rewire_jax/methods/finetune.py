@@ -42,12 +42,12 @@ def ft1(spec: Spec, options: FinetuneSettings) -> Method:
     del options
     return Method(
         init=lambda key: (networks.init_mlp(key, spec.sizes()), ()),
-        distribution=lambda params, memory, context, observation: networks.mlp_policy(
+        distribution=lambda params, state, context, observation: networks.mlp_policy(
             params, observation
         ),
-        policy=lambda params, memory, task: params,
+        policy=lambda params, state, task: params,
         act=networks.mlp_policy,
-        size=lambda params, memory: jnp.asarray(count(params)),
+        size=lambda params, state: jnp.asarray(count(params)),
     )
 
 
@@ -59,20 +59,20 @@ def ft_n(spec: Spec, options: FinetuneSettings) -> Method:
         params, _ = plain.init(key)
         return params, Kept(jnp.zeros((), jnp.int32), tile(params, spec.tasks))
 
-    def end_task(params, memory, task, selection):
+    def end_task(params, state, task, selection):
         del selection
-        return params, Kept(memory.learned + 1, put(memory.policies, task, params))
+        return params, Kept(state.learned + 1, put(state.policies, task, params))
 
-    def policy(params, memory, task):
-        finished = task < memory.learned
-        own = at(memory.policies, task)
+    def policy(params, state, task):
+        finished = task < state.learned
+        own = at(state.policies, task)
         return jax.tree.map(lambda a, b: jnp.where(finished, a, b), own, params)
 
     return plain._replace(
         init=init,
         end_task=end_task,
         policy=policy,
-        size=lambda params, memory: jnp.maximum(memory.learned, 1) * count(params),
+        size=lambda params, state: jnp.maximum(state.learned, 1) * count(params),
     )
 
 
@@ -80,8 +80,8 @@ def sac_n(spec: Spec, options: FinetuneSettings) -> Method:
     """Each task's policy starts from fresh weights, and is kept."""
     plain = ft_n(spec, options)
 
-    def start_task(key, params, memory, task):
+    def start_task(key, params, state, task):
         del params, task
-        return plain.init(key)[0], memory
+        return plain.init(key)[0], state
 
     return plain._replace(start_task=start_task)

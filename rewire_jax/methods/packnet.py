@@ -58,7 +58,7 @@ def preset(scenario: str, period: int, profile: str) -> PackNetSettings:
     )
 
 
-class Memory(NamedTuple):
+class State(NamedTuple):
     """Who owns what.
 
     Attributes:
@@ -79,34 +79,34 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
     def init(key):
         params = networks.init_mlp(key, spec.sizes())
         owners = jax.tree.map(lambda x: jnp.full(x.shape, FREE, jnp.int32), params)
-        return params, Memory(
+        return params, State(
             learned=jnp.zeros((), jnp.int32),
             owners=owners,
             trained=jnp.full((), FREE, jnp.int32),
         )
 
-    def adjust_updates(updates, memory):
+    def adjust_updates(updates, state):
         return jax.tree.map(
-            lambda update, owner: jnp.where(owner == memory.trained, update, 0.0),
+            lambda update, owner: jnp.where(owner == state.trained, update, 0.0),
             updates,
-            memory.owners,
+            state.owners,
         )
 
-    def consolidate(key, params, memory, task, tools):
+    def consolidate(key, params, state, task, tools):
         del key, tools
         owners = jax.tree.map(
             lambda x, owner: jnp.where(
                 largest(x, owner == FREE, options.keep), task, owner
             ),
             params,
-            memory.owners,
+            state.owners,
         )
         # What is pruned starts the next task at 0.
         params = jax.tree.map(
             lambda x, owner: jnp.where(owner == FREE, 0.0, x), params, owners
         )
-        trained = jnp.full_like(memory.trained, task)
-        return params, memory._replace(owners=owners, trained=trained)
+        trained = jnp.full_like(state.trained, task)
+        return params, state._replace(owners=owners, trained=trained)
 
     def offline_sac(sac):
         if options.finetune_targets == "delay":
@@ -114,29 +114,29 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
         both = math.lcm(sac.policy_delay, sac.target_delay)
         return dataclasses.replace(sac, target_delay=both)
 
-    def end_task(params, memory, task, selection):
+    def end_task(params, state, task, selection):
         del task, selection
-        return params, memory._replace(
-            learned=memory.learned + 1, trained=jnp.full_like(memory.trained, FREE)
+        return params, state._replace(
+            learned=state.learned + 1, trained=jnp.full_like(state.trained, FREE)
         )
 
-    def policy(params, memory, task):
+    def policy(params, state, task):
         # Whole for a task not yet learned: beyond what is owned it holds zeros, or,
         # before the first task, the weights that it will start from.
         def part(x, owner):
             kept = (owner != FREE) & (owner <= task)
-            return jnp.where(kept | (task >= memory.learned), x, 0.0)
+            return jnp.where(kept | (task >= state.learned), x, 0.0)
 
-        return jax.tree.map(part, params, memory.owners)
+        return jax.tree.map(part, params, state.owners)
 
     return Method(
         init=init,
-        distribution=lambda params, memory, context, observation: networks.mlp_policy(
+        distribution=lambda params, state, context, observation: networks.mlp_policy(
             params, observation
         ),
         policy=policy,
         act=networks.mlp_policy,
-        size=lambda params, memory: jnp.asarray(count(params) + count(memory.owners)),
+        size=lambda params, state: jnp.asarray(count(params) + count(state.owners)),
         adjust_updates=adjust_updates,
         consolidate=consolidate,
         offline=options.finetune,

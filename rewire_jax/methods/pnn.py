@@ -69,7 +69,7 @@ class Column(NamedTuple):
     laterals: tuple[Lateral, ...]
 
 
-class Memory(NamedTuple):
+class State(NamedTuple):
     """Finished columns.
 
     Attributes:
@@ -119,28 +119,28 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
 
     def init(key):
         params = init_column(key, jnp.zeros((), jnp.int32))
-        return params, Memory(jnp.zeros((), jnp.int32), tile(params, tasks))
+        return params, State(jnp.zeros((), jnp.int32), tile(params, tasks))
 
-    def start_task(key, params, memory, task):
+    def start_task(key, params, state, task):
         del params
-        return init_column(key, task), memory
+        return init_column(key, task), state
 
-    def distribution(params, memory, context, observation):
+    def distribution(params, state, context, observation):
         del context
-        return play(memory.columns, params, memory.learned, observation)
+        return play(state.columns, params, state.learned, observation)
 
-    def end_task(params, memory, task, selection):
+    def end_task(params, state, task, selection):
         del selection
-        columns = put(memory.columns, task, params)
-        return params, Memory(memory.learned + 1, columns)
+        columns = put(state.columns, task, params)
+        return params, State(state.learned + 1, columns)
 
-    def policy(params, memory, task):
+    def policy(params, state, task):
         del params
-        latest = jnp.maximum(memory.learned - 1, 0)
-        return Policy(Shared(memory.columns), jnp.minimum(task, latest))
+        latest = jnp.maximum(state.learned - 1, 0)
+        return Policy(Shared(state.columns), jnp.minimum(task, latest))
 
-    def size(params, memory):
-        columns = jnp.maximum(memory.learned, 1)
+    def size(params, state):
+        columns = jnp.maximum(state.learned, 1)
         scales_and_outer = count([(x.scale, x.outer) for x in params.laterals])
         inner = spec.depth * width * width
         pairs = columns * (columns - 1) // 2

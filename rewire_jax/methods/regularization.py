@@ -104,7 +104,7 @@ def preset_ewc(scenario: str, period: int, profile: str) -> EwcSettings:
     )
 
 
-class Memory(NamedTuple):
+class State(NamedTuple):
     """What the pull is made of.
 
     Attributes:
@@ -120,12 +120,12 @@ class Memory(NamedTuple):
 def ft_l2(spec: Spec, options: FtL2Settings) -> Method:
     """One policy, and Σ (w − w_prev)² over its weights and biases as a penalty."""
 
-    def end_task(params, memory, task, selection):
+    def end_task(params, state, task, selection):
         del task, selection
-        return params, Memory(params, jax.tree.map(jnp.ones_like, memory.importance))
+        return params, State(params, jax.tree.map(jnp.ones_like, state.importance))
 
     return _pulled(spec, options.coefficient, lambda w: jnp.zeros(()))._replace(
-        end_task=end_task, size=lambda params, memory: jnp.asarray(2 * count(params))
+        end_task=end_task, size=lambda params, state: jnp.asarray(2 * count(params))
     )
 
 
@@ -135,17 +135,17 @@ def ewc(spec: Spec, options: EwcSettings) -> Method:
     F is the sum of the finished tasks' diagonals of the Fisher information.
     """
 
-    def consolidate(key, params, memory, task, tools):
+    def consolidate(key, params, state, task, tools):
         del task
         states = tools.sample(key, options.fisher_states).observation
         importance = jax.tree.map(
-            jnp.add, memory.importance, fisher_diagonal(params, states)
+            jnp.add, state.importance, fisher_diagonal(params, states)
         )
-        return params, Memory(params, importance)
+        return params, State(params, importance)
 
     return _pulled(spec, options.coefficient, jnp.zeros_like)._replace(
         consolidate=consolidate,
-        size=lambda params, memory: jnp.asarray(3 * count(params)),
+        size=lambda params, state: jnp.asarray(3 * count(params)),
     )
 
 
@@ -157,15 +157,15 @@ def _pulled(
 
     def init(key):
         params, _ = plain.init(key)
-        return params, Memory(params, jax.tree.map(no_importance, params))
+        return params, State(params, jax.tree.map(no_importance, params))
 
-    def penalty(key, params, memory, context, observation, gaussian):
+    def penalty(key, params, state, context, observation, gaussian):
         del key, context, observation, gaussian
         terms = jax.tree.map(
             lambda f, w, previous: jnp.sum(f * (w - previous) ** 2),
-            memory.importance,
+            state.importance,
             params,
-            memory.previous,
+            state.previous,
         )
         distance = sum(jax.tree.leaves(terms))
         return coefficient * distance, {"distance": distance}

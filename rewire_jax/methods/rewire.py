@@ -168,7 +168,7 @@ class Params(NamedTuple):
     adapters: wiring.Adapters
 
 
-class Memory(NamedTuple):
+class State(NamedTuple):
     """What is kept from task to task.
 
     Attributes:
@@ -220,24 +220,24 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             scores=tile(wiring.spread(orders[0]), places),
             adapters=wiring.identity_adapters(depth, n),
         )
-        return params, Memory(jnp.zeros((), jnp.int32), hidden, head, orders)
+        return params, State(jnp.zeros((), jnp.int32), hidden, head, orders)
 
-    def known_slot(memory, task):
+    def known_slot(state, task):
         # A task that has not been seen has its earlier round's slot, or the latest.
-        return jnp.minimum(task % slots, jnp.maximum(memory.learned - 1, 0))
+        return jnp.minimum(task % slots, jnp.maximum(state.learned - 1, 0))
 
-    def start_task(key, params, memory, task):
+    def start_task(key, params, state, task):
         del key
-        source = known_slot(memory, task)
+        source = known_slot(state, task)
         head = at(params.heads, source)
         return Params(
             hidden=params.hidden,
             heads=put(params.heads, task % slots, head),
-            scores=tile(wiring.spread(memory.orders[source % cached]), places),
+            scores=tile(wiring.spread(state.orders[source % cached]), places),
             adapters=wiring.identity_adapters(depth, n),
-        ), memory._replace(head=head)
+        ), state._replace(head=head)
 
-    def context(key, memory, purpose, label):
+    def context(key, state, purpose, extras):
         mode_key, other_key, noise_key, key = jax.random.split(key, 4)
         mode = jax.random.randint(mode_key, (), 0, modes)
         offset = jax.random.randint(other_key, (), 1, jnp.maximum(modes, 2))
@@ -246,7 +246,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             noise = options.noise * jax.random.gumbel(noise_key, (depth, n))
         return Context(mode, (mode + offset) % modes, noise, key)
 
-    def forward(params, memory, scores, key, observation):
+    def forward(params, state, scores, key, observation):
         x = observation
         for layer, v in zip(params.hidden, scores, strict=True):
             key, drop_key = jax.random.split(key)
@@ -255,7 +255,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             # of the scores' gradient.
             x = _dropout(drop_key, x, options.dropout)
             x = networks.activate(x)
-        head = at(params.heads, memory.learned % slots)
+        head = at(params.heads, state.learned % slots)
         return networks.gaussian(networks.affine(head, x))
 
     def scores_of(params, mode):
@@ -265,35 +265,35 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             scores += (modes - 1) * (scores - jax.lax.stop_gradient(scores))
         return scores
 
-    def distribution(params, memory, context, observation):
+    def distribution(params, state, context, observation):
         scores = scores_of(params, context.mode) + context.noise
-        return forward(params, memory, scores, context.key, observation)
+        return forward(params, state, scores, context.key, observation)
 
-    def penalty(key, params, memory, context, observation, gaussian):
+    def penalty(key, params, state, context, observation, gaussian):
         scores = params.scores[context.other]
-        other = jax.lax.stop_gradient(forward(params, memory, scores, key, observation))
+        other = jax.lax.stop_gradient(forward(params, state, scores, key, observation))
         divergence = _DIVERGENCES[options.distillation](other, gaussian)
         distillation = jnp.where(modes > 1, jnp.mean(divergence), 0.0)
         loss = options.alpha * DISTILLED_STATES * distillation
-        return loss + options.beta * alignment(params, memory), {
+        return loss + options.beta * alignment(params, state), {
             "distillation": distillation
         }
 
-    def alignment(params, memory):
+    def alignment(params, state):
         if options.alignment == "off":
-            loss = wiring.squared_distance(params.hidden, memory.previous)
+            loss = wiring.squared_distance(params.hidden, state.previous)
         else:
             loss = wiring.alignment_loss(
                 params.hidden,
-                memory.previous,
+                state.previous,
                 params.adapters,
                 options.adapter_tau,
                 expanded=options.alignment == "expanded",
             )
-        return jnp.where(memory.learned > 0, loss, 0.0)
+        return jnp.where(state.learned > 0, loss, 0.0)
 
-    def adjust_updates(updates, memory):
-        del memory
+    def adjust_updates(updates, state):
+        del state
         rate = 1.0 if options.mode_rate == "gradient" else modes
         return updates._replace(
             scores=updates.scores * rate,
@@ -302,11 +302,11 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             ),
         )
 
-    def choosing(memory):
-        return (memory.learned > 0) | options.select_first
+    def choosing(state):
+        return (state.learned > 0) | options.select_first
 
-    def mode_policies(params, memory):
-        head = at(params.heads, memory.learned % slots)
+    def mode_policies(params, state):
+        head = at(params.heads, state.learned % slots)
 
         def policy(scores):
             orders = jnp.argsort(scores, axis=-1)
@@ -314,14 +314,14 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
 
         return jax.vmap(policy)(params.scores)
 
-    def candidates(params, memory, task):
+    def candidates(params, state, task):
         del task
-        valid = (jnp.arange(places) < modes) & choosing(memory)
-        return Candidates(mode_policies(params, memory), valid)
+        valid = (jnp.arange(places) < modes) & choosing(state)
+        return Candidates(mode_policies(params, state), valid)
 
-    def inspect(params, memory, observation):
+    def inspect(params, state, observation):
         # Without noise and dropout, unlike the distillation.
-        policies, valid = mode_policies(params, memory), jnp.arange(places) < modes
+        policies, valid = mode_policies(params, state), jnp.arange(places) < modes
         gaussians = jax.vmap(networks.mlp_policy, (0, None))(policies, observation)
         against = jax.vmap(gaussian_kl, (None, 0))
         pairs = jnp.mean(jax.vmap(against, (0, None))(gaussians, gaussians), axis=-1)
@@ -330,10 +330,10 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         return {
             "mode_divergence": total / jnp.maximum(modes * (modes - 1), 1),
             # Its gradient needs less than its value: updates do without.
-            "alignment": alignment(params, memory),
+            "alignment": alignment(params, state),
         }
 
-    def end_task(params, memory, task, selection):
+    def end_task(params, state, task, selection):
         order = jnp.argsort(params.scores[0], axis=-1)
         failed = jnp.asarray(False)
         if selection is not None:
@@ -342,45 +342,45 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
             valued = valid & ~jnp.isnan(selection.after)
             after = jnp.where(valued, selection.after, -jnp.inf)
             before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / modes
-            chosen = choosing(memory) * jnp.argmax(after)
+            chosen = choosing(state) * jnp.argmax(after)
             order = jnp.argsort(params.scores[chosen], axis=-1)
-            failed = (memory.learned > 0) & (jnp.max(after) < before)
+            failed = (state.learned > 0) & (jnp.max(after) < before)
         began = Params(
-            hidden=memory.previous,
-            heads=put(params.heads, task % slots, memory.head),
+            hidden=state.previous,
+            heads=put(params.heads, task % slots, state.head),
             scores=params.scores,
             adapters=wiring.identity_adapters(depth, n),
         )
         params = jax.tree.map(lambda a, b: jnp.where(failed, a, b), began, params)
-        latest = memory.orders[known_slot(memory, task) % cached]
+        latest = state.orders[known_slot(state, task) % cached]
         order = jnp.where(failed, latest, order)
-        refined = wiring.refine(memory.orders, params.adapters)
+        refined = wiring.refine(state.orders, params.adapters)
         # Before the first task there is nothing the weights could be aligned with.
-        refined = jnp.where(memory.learned > 0, refined, memory.orders)
+        refined = jnp.where(state.learned > 0, refined, state.orders)
         order = order.astype(refined.dtype)
         return Params(
             hidden=params.hidden,
             heads=params.heads,
             scores=tile(wiring.spread(order), places),
             adapters=wiring.identity_adapters(depth, n),
-        ), Memory(
-            learned=memory.learned + 1,
+        ), State(
+            learned=state.learned + 1,
             previous=params.hidden,
-            head=memory.head,
+            head=state.head,
             orders=refined.at[task % slots % cached].set(order),
         )
 
-    def policy(params, memory, task):
-        slot = known_slot(memory, task)
-        folded = wiring.fold(params.hidden, memory.orders[slot % cached])
+    def policy(params, state, task):
+        slot = known_slot(state, task)
+        folded = wiring.fold(params.hidden, state.orders[slot % cached])
         return [*folded, at(params.heads, slot)]
 
-    def size(params, memory):
+    def size(params, state):
         one_mode = depth * n
         stored = count(params) - (places - modes) * one_mode
         if options.alignment == "off":
             stored -= count(params.adapters)
-        return stored + count(memory.previous) + count(memory.head) + memory.orders.size
+        return stored + count(state.previous) + count(state.head) + state.orders.size
 
     return Method(
         init=init,

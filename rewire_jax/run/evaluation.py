@@ -63,14 +63,14 @@ def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
         key = jax.random.key(0)
 
         def one(carry: Any, task: jax.Array) -> tuple[Any, jax.Array]:
-            params, memory = method.start_task(key, *carry, task)
+            params, method_state = method.start_task(key, *carry, task)
             selection = None
             if method.candidates is not None:
-                valid = method.candidates(params, memory, task).valid
+                valid = method.candidates(params, method_state, task).valid
                 after = 1.0 + jnp.arange(valid.size)
                 after = jnp.where(best_first, after[::-1], after)
                 selection = Selection(jnp.zeros_like(after), after)
-            carry = method.end_task(params, memory, task, selection)
+            carry = method.end_task(params, method_state, task, selection)
             return carry, method.size(*carry)
 
         _, sizes = jax.lax.scan(one, method.init(key), jnp.arange(spec.tasks))
@@ -109,12 +109,14 @@ def evaluate(
     )
     _, settings = saved(folder)
     plan = prepare(settings)
-    learner = jax.eval_shape(plan.program.init, plan.members)
-    like = learner.params, learner.memory
-    params, memory = run_state.read_policies(folder, stage, like)
-    learner = plan.program.init(plan.members)._replace(params=params, memory=memory)
-    policies = plan.program.policies(plan.members, learner)
-    keys = jax.random.split(jax.random.key(seed), (plan.places, len(plan.names)))
+    learner = jax.eval_shape(plan.program.init, plan.stacked)
+    like = learner.params, learner.method_state
+    params, method_state = run_state.read_policies(folder, stage, like)
+    learner = plan.program.init(plan.stacked)._replace(
+        params=params, method_state=method_state
+    )
+    policies = plan.program.policies(plan.stacked, learner)
+    keys = jax.random.split(jax.random.key(seed), (plan.num_slots, len(plan.names)))
     result = plan.program.rollout(plan.tasks, policies, keys, episodes)
     returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
     solved = {n: np.asarray(x) for n, x in rollout.named(result.success).items()}
@@ -128,6 +130,6 @@ def evaluate(
             "steps": int(lengths[place, task].sum()),
         }
         | {name: float(x[place, task].mean()) for name, x in solved.items()}
-        for place, member in enumerate(plan.crowd)
+        for place, member in enumerate(plan.members)
         for task, name in enumerate(plan.names)
     ]

@@ -27,12 +27,12 @@ class Learned(NamedTuple):
 
     Attributes:
       params: what its method trains.
-      memory: what its method keeps from task to task; of `rewire`,
+      method_state: what its method keeps from task to task; of `rewire`,
         `orders` `[slots, L, n]`, the cached wirings.
     """
 
     params: Any
-    memory: Any
+    method_state: Any
 
 
 class Policies(NamedTuple):
@@ -97,13 +97,13 @@ def load_policy(
             raise UserError(f"{folder} holds a run: give seed, not member")
         seed = settings.seed if seed is None else seed
         found = Found(folder, stage, seed - settings.seed, settings.seeds)
-        if not 0 <= found.place < found.places:
+        if not 0 <= found.place < found.num_slots:
             raise UserError(
                 f"{folder} has no seed {seed}: see {run_folder.HEADER} there"
             )
     method = find_method(settings.method).make(spec, settings.options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
-    policy = method.policy(learned.params, learned.memory, jnp.asarray(task))
+    policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
     return functools.partial(_act, method, policy)
 
 
@@ -127,7 +127,7 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
     method = find_method(settings.method).make(spec, settings.options)
 
     def act(member: Learned, task: jax.Array | int, observation: jax.Array):
-        policy = method.policy(member.params, member.memory, jnp.asarray(task))
+        policy = method.policy(member.params, member.method_state, jnp.asarray(task))
         return _act(method, policy, observation)
 
     seeds = range(settings.seed, settings.seed + settings.seeds)
@@ -147,8 +147,8 @@ def _act(method: Method, policy: Any, observation: jax.Array) -> jax.Array:
 
 
 def _load(found: Found, method: Method) -> Learned:
-    """What those have learned that were trained side by side, `[places]`."""
-    keys = jax.vmap(jax.random.key)(jnp.arange(found.places))
+    """What those have learned that were trained side by side, `[num_slots]`."""
+    keys = jax.vmap(jax.random.key)(jnp.arange(found.num_slots))
     like = jax.eval_shape(jax.vmap(method.init), keys)
     learned = run_state.read_policies(found.folder, found.stage, like)
     return Learned(*jax.tree.map(jnp.asarray, learned))

@@ -35,7 +35,7 @@ class RunState(NamedTuple):
       learner: between tasks, what was learned.
       state: within a task, all of it.
       before: within a task, the candidates' returns at its start, or None.
-      alive: `[members]` bool on the host, False for frozen members.
+      active: `[members]` bool on the host, False for frozen members.
       selection: `[members]` int, interactions spent on candidates so far.
     """
 
@@ -44,7 +44,7 @@ class RunState(NamedTuple):
     learner: TrainState | None
     state: RunnerState | None
     before: jax.Array | None
-    alive: np.ndarray
+    active: np.ndarray
     selection: jax.Array
 
 
@@ -53,11 +53,11 @@ def start(plan: Plan) -> RunState:
     return RunState(
         stage=0,
         steps=0,
-        learner=plan.program.init(plan.members),
+        learner=plan.program.init(plan.stacked),
         state=None,
         before=None,
-        alive=np.ones(plan.places, bool),
-        selection=jnp.zeros(plan.places, jnp.int32),
+        active=np.ones(plan.num_slots, bool),
+        selection=jnp.zeros(plan.num_slots, jnp.int32),
     )
 
 
@@ -70,7 +70,7 @@ def interactions(standing: RunState, plan: Plan) -> int:
 def save(folder: Path, standing: RunState) -> None:
     """Writes a checkpoint, and drops those from within a task that it outdates."""
     items: dict[str, Any] = {
-        "counts": {"alive": standing.alive, "selection": standing.selection}
+        "counts": {"active": standing.active, "selection": standing.selection}
     }
     name = _name(standing.stage, standing.steps)
     if standing.learner is not None:
@@ -142,7 +142,7 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
 
 
 def _load(path: Path, plan: Plan) -> tuple[RunState, dict[str, run_folder.Mark]]:
-    program, members = plan.program, plan.members
+    program, members = plan.program, plan.stacked
     learner = jax.eval_shape(program.init, members)
     like: dict[str, Any] = {"counts": _counts(plan)}
     metadata = _facts(path)
@@ -150,7 +150,7 @@ def _load(path: Path, plan: Plan) -> tuple[RunState, dict[str, run_folder.Mark]]
     if "state" in saved:
         task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
         like["state"] = program.state_shape(
-            members, learner, like["counts"]["alive"], 0, task
+            members, learner, like["counts"]["active"], 0, task
         )
     else:
         like |= _kept(learner)
@@ -167,7 +167,7 @@ def _load(path: Path, plan: Plan) -> tuple[RunState, dict[str, run_folder.Mark]]
         learner=None,
         state=items["state"],
         before=items.get("before"),
-        alive=np.asarray(items["counts"]["alive"]),
+        active=np.asarray(items["counts"]["active"]),
         selection=items["counts"]["selection"],
     ), metadata["tables"]
 
@@ -178,7 +178,7 @@ def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
     Raises:
       CheckpointError: it is missing or damaged.
     """
-    learner = jax.eval_shape(plan.program.init, plan.members)
+    learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = {"counts": _counts(plan)} | _kept(learner)
     path = folder / _FOLDER / _name(stage + 1)
     _facts(path)
@@ -191,7 +191,7 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
     Args:
       folder: of the run.
       stage: of its sequence, or None.
-      like: params and memory, `[members]`, as shapes.
+      like: params and method_state, `[members]`, as shapes.
 
     Returns:
       The same, on the host.
@@ -231,30 +231,30 @@ def _facts(path: Path) -> dict[str, Any]:
 def between(stage: int, items: dict[str, Any], plan: Plan) -> RunState:
     """The standing before a task, from what is kept after the one before."""
     items = population.place(items, plan.mesh)
-    params, memory = items["policy"]
+    params, method_state = items["policy"]
     return RunState(
         stage=stage,
         steps=0,
         # The rest of a learner starts anew with the next task.
-        learner=plan.program.init(plan.members)._replace(
-            params=params, memory=memory, critic=items["critic"]
+        learner=plan.program.init(plan.stacked)._replace(
+            params=params, method_state=method_state, critic=items["critic"]
         ),
         state=None,
         before=None,
-        alive=np.asarray(items["counts"]["alive"]),
+        active=np.asarray(items["counts"]["active"]),
         selection=items["counts"]["selection"],
     )
 
 
 def _counts(plan: Plan) -> dict[str, Any]:
     return {
-        "alive": jax.ShapeDtypeStruct((plan.places,), bool),
-        "selection": jax.ShapeDtypeStruct((plan.places,), jnp.int32),
+        "active": jax.ShapeDtypeStruct((plan.num_slots,), bool),
+        "selection": jax.ShapeDtypeStruct((plan.num_slots,), jnp.int32),
     }
 
 
 def _kept(learner: TrainState) -> dict[str, Any]:
-    return {"policy": (learner.params, learner.memory), "critic": learner.critic}
+    return {"policy": (learner.params, learner.method_state), "critic": learner.critic}
 
 
 def _name(tasks: int, steps: int = 0) -> str:

@@ -53,7 +53,7 @@ class Sweep:
       folder: of the sweep.
       settings: what all members share; at the axes, the first configuration's.
       scenario: of all members.
-      crowd: all members, the seeds of a configuration side by side.
+      members: all members, the seeds of a configuration side by side.
       axes: names of the settings in which they differ.
       halving: of the configurations, one in this many goes on to the next task.
       most: members trained side by side at most.
@@ -64,7 +64,7 @@ class Sweep:
     folder: Path
     settings: Settings
     scenario: Scenario
-    crowd: tuple[Member, ...]
+    members: tuple[Member, ...]
     axes: tuple[str, ...]
     halving: int
     most: int
@@ -79,10 +79,10 @@ class Sweep:
         """
         try:
             for stage in range(self.settings.tasks):
-                batches, places = self.batches(stage)
+                batches, num_slots = self.batches(stage)
                 own = range(jax.process_index(), len(batches), jax.process_count())
                 for number in own:
-                    self.train(stage, number, batches, places)
+                    self.train(stage, number, batches, num_slots)
                 # Also at the end: who coordinates must outlive the others.
                 _wait(functools.partial(self.finished, stage, len(batches)))
         except (Stopped, KeyboardInterrupt):
@@ -92,7 +92,7 @@ class Sweep:
             ) from None
 
     def batches(self, stage: int) -> tuple[list[list[int]], int]:
-        """Numbers of the members trained on a task, batch by batch, and the places."""
+        """Numbers of the members trained on a task, by batch, and a batch's slots."""
         path = batches_of(self.folder, stage)
         if jax.process_index() == 0 and not path.exists():
             numbers = self.survivors(stage)
@@ -106,7 +106,7 @@ class Sweep:
     def survivors(self, stage: int) -> list[int]:
         """The members that are to be trained on a task."""
         if stage == 0:
-            return [member.number for member in self.crowd]
+            return [member.number for member in self.members]
         before = [n for batch in self.batches(stage - 1)[0] for n in batch]
         if self.halving == 1:
             return before
@@ -121,7 +121,7 @@ class Sweep:
     def share(self, members: int) -> tuple[int, int]:
         """Places in a batch and how many batches, for so many members."""
         devices = jax.local_device_count()
-        # In whole rounds of the devices, as places are.
+        # In whole rounds of the devices, as num_slots are.
         most = max(self.most - self.most % devices, min(self.most, devices))
         count = math.ceil(members / most)
         if members >= jax.process_count():
@@ -136,29 +136,29 @@ class Sweep:
         folders = (batch(self.folder, stage, number) for number in range(batches))
         return all(run_state.finished(folder, stage) for folder in folders)
 
-    def plan(self, numbers: Sequence[int], places: int) -> Plan:
+    def plan(self, numbers: Sequence[int], num_slots: int) -> Plan:
         """The plan of a batch."""
-        crowd = [self.crowd[number] for number in numbers]
-        return prepare(self.settings, self.scenario, crowd, places)
+        members = [self.members[number] for number in numbers]
+        return prepare(self.settings, self.scenario, members, num_slots)
 
     def train(
-        self, stage: int, number: int, batches: list[list[int]], places: int
+        self, stage: int, number: int, batches: list[list[int]], num_slots: int
     ) -> None:
         """Trains a batch on a task, or what is left of that."""
         folder = batch(self.folder, stage, number)
         if run_state.finished(folder, stage):
             return
-        plan = self.plan(batches[number], places)
+        plan = self.plan(batches[number], num_slots)
         run_folder.make(folder)
         label = f"{self.settings.method} sweep on {self.settings.scenario}"
         if len(batches) > 1:
             label += f", batch {number + 1} of {len(batches)}"
-        names = [member.name for member in plan.crowd]
+        names = [member.name for member in plan.members]
         with ExitStack() as stack:
             display = stack.enter_context(
                 self.progress(plan.names, plan.interactions, names, label)
             )
-            subjects = [self.subject(member) for member in plan.crowd]
+            subjects = [self.subject(member) for member in plan.members]
             logs = stack.enter_context(Loggers(self.log, subjects, display.message))
             run = Run(plan, folder, display, logs, choosing=True)
 
@@ -192,14 +192,14 @@ class Sweep:
     def gather(self, stage: int, plan: Plan) -> RunState:
         """A batch's members as they were after the task before, wherever that was."""
         found: dict[int, Any] = {}
-        wanted = {member.number for member in plan.crowd}
-        batches, places = self.batches(stage - 1)
+        wanted = {member.number for member in plan.members}
+        batches, num_slots = self.batches(stage - 1)
         for number, numbers in enumerate(batches):
             if wanted.isdisjoint(numbers):
                 continue
             folder = batch(self.folder, stage - 1, number)
             try:
-                made = self.plan(numbers, places)
+                made = self.plan(numbers, num_slots)
                 items = run_state.read_kept(folder, stage - 1, made)
             except checkpoint.CheckpointError as error:
                 raise UserError(
@@ -207,8 +207,8 @@ class Sweep:
                 ) from error
             for place, name in enumerate(numbers):
                 found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
-        rows = [found[member.number] for member in plan.crowd]
-        rows += rows[:1] * (plan.places - len(rows))
+        rows = [found[member.number] for member in plan.members]
+        rows += rows[:1] * (plan.num_slots - len(rows))
         items = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)
         return run_state.between(stage, items, plan)
 
@@ -264,27 +264,27 @@ def sweep(
     if not configurations:
         require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
         configurations = draws(given, random, settings) if random else grid(given)
-    settings, crowd = _crowd(settings, configurations)
+    settings, members = _members(settings, configurations)
     scenario = scenario or make_scenario(
         settings.scenario, settings.backend, settings.reward
     )
-    plan = prepare(settings, scenario, crowd[:1])
-    members = [
+    plan = prepare(settings, scenario, members[:1])
+    told = [
         {
             "member": member.number,
             "configuration": member.number // settings.seeds,
             "seed": member.seed,
             "values": {name: read(member, name) for name in configurations[0]},
         }
-        for member in crowd
+        for member in members
     ]
     header = {
         "kind": "sweep",
         "settings": to_json(plan.settings),
-        "axes": given or _values(members),
+        "axes": given or _values(told),
         "random": random,
         "halving": halving,
-        "members": members,
+        "members": told,
         "tasks": plan.names,
         "spec": plan.spec._asdict(),
         "episode_length": scenario.environment.episode_length,
@@ -306,7 +306,7 @@ def sweep(
             folder=folder,
             settings=plan.settings,
             scenario=scenario,
-            crowd=crowd,
+            members=members,
             axes=tuple(configurations[0]),
             halving=halving,
             most=members_per_batch
@@ -314,13 +314,13 @@ def sweep(
             log=tuple(log),
             progress=progress,
         )
-        size, _ = made.share(len(crowd))
-        print(f"{need}; {len(crowd)} members, {size} at a time", file=sys.stderr)
+        size, _ = made.share(len(members))
+        print(f"{need}; {len(members)} members, {size} at a time", file=sys.stderr)
         made.run()
     return folder
 
 
-def _crowd(
+def _members(
     settings: Settings, configurations: Sequence[Mapping[str, float]]
 ) -> tuple[Settings, tuple[Member, ...]]:
     """The settings that a population shares, and its members."""
@@ -332,11 +332,11 @@ def _crowd(
     together = find_method(settings.method).together([v.options for v in variants])
     pairs = [(v.sac, options) for v, options in zip(variants, together, strict=True)]
     seeds = range(settings.seed, settings.seed + settings.seeds)
-    crowd = tuple(
+    members = tuple(
         member._replace(name=f"member {member.number}")
         for member in population.cross(pairs, seeds)
     )
-    return replace(variants[0], options=together[0]), crowd
+    return replace(variants[0], options=together[0]), members
 
 
 class Found(NamedTuple):
@@ -345,7 +345,7 @@ class Found(NamedTuple):
     folder: Path
     stage: int | None
     place: int
-    places: int
+    num_slots: int
 
 
 def find(folder: Path, member: int, stage: int | None) -> Found:
@@ -357,11 +357,11 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
     begun = folder.glob("task-[0-9][0-9][0-9]/batches.json")
     stages = sorted(int(path.parent.name[-3:]) for path in begun)
     for each in reversed(stages) if stage is None else {stage}.intersection(stages):
-        batches, places = read_batches(batches_of(folder, each))
+        batches, num_slots = read_batches(batches_of(folder, each))
         for number, members in enumerate(batches):
             inside = batch(folder, each, number)
             if member in members and run_state.finished(inside, each):
-                return Found(inside, each, members.index(member), places)
+                return Found(inside, each, members.index(member), num_slots)
     when = "any task" if stage is None else f"task {stage}"
     raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
 

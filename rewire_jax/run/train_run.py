@@ -112,8 +112,8 @@ class Run:
 
     def begin(self, now: RunState, task: Task) -> RunState:
         """Starts a task: fresh optimisers, environments and buffer."""
-        program, members, stage = self.plan.program, self.plan.members, now.stage
-        state = program.begin(members, now.learner, now.alive, stage, task)
+        program, members, stage = self.plan.program, self.plan.stacked, now.stage
+        state = program.begin(members, now.learner, now.active, stage, task)
         now = now._replace(learner=None, state=state)
         if not program.baseline:
             return now
@@ -132,7 +132,7 @@ class Run:
         program, rows = self.plan.program, self.plan.rows
         if program.candidates is None or not rows:
             return None, now.selection
-        candidates = program.candidates(self.plan.members, learner, now.stage)
+        candidates = program.candidates(self.plan.stacked, learner, now.stage)
         mesh = self.plan.mesh
         if not candidates.valid.any():
             # What is given to the end of a task is of one type, played or not.
@@ -150,12 +150,12 @@ class Run:
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
         """Random keys `[members, rows]` that depend on nothing but the arguments."""
-        return _make_keys(self.plan.members.keys, stream, number, rows)
+        return _make_keys(self.plan.stacked.keys, stream, number, rows)
 
     def chunk(self, now: RunState, task: Task) -> RunState:
         """Trains until the next progress report."""
         began = clock.perf_counter()
-        program, members, stage = self.plan.program, self.plan.members, now.stage
+        program, members, stage = self.plan.program, self.plan.stacked, now.stage
         done, unit = now.steps, self.plan.settings.update_every
         steps = self.due(done, self.plan.steps, unit)
         traces = program.traces()
@@ -179,7 +179,7 @@ class Run:
         steps = self.due(before, plan.steps + plan.offline_steps, 1)
         compiled = plan.program.offline_update._cache_size()  # type: ignore[attr-defined]
         state = plan.program.offline_update(
-            plan.members, now.state, stage, plan.steps, before - plan.steps, steps
+            plan.stacked, now.state, stage, plan.steps, before - plan.steps, steps
         )
         now = self.advance(now, state, steps)
         timing = {
@@ -195,7 +195,7 @@ class Run:
         self.progress.update(
             stage,
             plan.interactions,
-            [None] * len(plan.crowd),
+            [None] * len(plan.members),
             rate=None,
             note=f"updates without interactions: {share:.0%}",
         )
@@ -216,15 +216,15 @@ class Run:
         self, now: RunState, state: train_loop.RunnerState, steps: int
     ) -> RunState:
         """The run after these steps; tells of members that were frozen in them."""
-        alive = np.array(state.alive)
-        lost = now.alive & ~alive
-        for place, member in enumerate(self.plan.crowd):
+        active = np.array(state.active)
+        lost = now.active & ~active
+        for place, member in enumerate(self.plan.members):
             if lost[place]:
                 self.progress.message(
                     f"{member.name}: a value is not finite in task {now.stage}; it is "
                     "updated no more, try lower learning rates"
                 )
-        return now._replace(steps=now.steps + steps, state=state, alive=alive)
+        return now._replace(steps=now.steps + steps, state=state, active=active)
 
     def save(self, now: RunState, before: int) -> None:
         """Writes a checkpoint from within a task if one is due after `before`."""
@@ -247,7 +247,7 @@ class Run:
         interactions = now.steps * settings.envs
         returns: list[float | None] = []
         rows, known = [], []
-        for place, member in enumerate(plan.crowd):
+        for place, member in enumerate(plan.members):
             ended = int(report.episodes[place])
             score = float(report.returns[place]) / ended if ended else None
             reward = float(report.rewards[place]) / steps
@@ -298,7 +298,7 @@ class Run:
 
     def conclude(self, now: RunState, task: Task) -> RunState:
         """Lets the method choose among its candidates, and end the task."""
-        program, members, stage = self.plan.program, self.plan.members, now.stage
+        program, members, stage = self.plan.program, self.plan.stacked, now.stage
         learner = now.learner
         assert learner is not None
         after, spent = self.select(now, learner, task, 1)
@@ -309,14 +309,14 @@ class Run:
             learner=program.finish(members, learner, stage, chosen_by),
             state=None,
             before=None,
-            alive=now.alive,
+            active=now.active,
             selection=spent,
         )
 
     def evaluate(self, now: RunState, stage: int) -> np.ndarray:
         """Plays all tasks without exploration; returns `[members, tasks]`."""
         plan, settings = self.plan, self.plan.settings
-        program, members = plan.program, plan.members
+        program, members = plan.program, plan.stacked
         policies = program.policies(members, now.learner)
 
         def play(stream):
@@ -345,15 +345,15 @@ class Run:
                     "training": (stage + 1) * plan.interactions,
                     "selection": int(selection[place]),
                 },
-                "diverged": not bool(now.alive[place]),
+                "diverged": not bool(now.active[place]),
                 "model_size": int(sizes[place]) / base_size(plan.spec),
             }
             | {name: _finite(float(x[place, index])) for name, x in scores.items()}
-            for place, member in enumerate(plan.crowd)
+            for place, member in enumerate(plan.members)
             for index in range(settings.tasks)
         ]
         run_folder.append(self.folder, "results.jsonl", rows)
-        for place in range(len(plan.crowd)):
+        for place in range(len(plan.members)):
             known = {
                 f"{name}/{index:02d}-{task}": _finite(float(x[place, index]))
                 for name, x in scores.items()
@@ -362,7 +362,7 @@ class Run:
             self.logs.scalars(
                 place, "evaluation", known, (stage + 1) * plan.interactions
             )
-        return scores["return"][: len(plan.crowd)]
+        return scores["return"][: len(plan.members)]
 
 
 @functools.partial(jax.jit, static_argnames="rows")
@@ -474,11 +474,13 @@ def train(
         if resume:
             run_folder.compare(folder, plan.settings)
         display = stack.enter_context(
-            progress(plan.names, plan.interactions, [m.name for m in plan.crowd], label)
+            progress(
+                plan.names, plan.interactions, [m.name for m in plan.members], label
+            )
         )
         subjects = [
             loggers.subject(folder, plan.settings, member, f"seed-{member.seed}")
-            for member in plan.crowd
+            for member in plan.members
         ]
         logs = stack.enter_context(Loggers(log, subjects, display.message))
         run = Run(plan, folder, display, logs)

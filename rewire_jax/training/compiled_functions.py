@@ -42,7 +42,7 @@ class Program(NamedTuple):
 
     Attributes:
       init: `members -> TrainState`.
-      begin: `(members, learner, alive, index, task) -> State`, a task's start.
+      begin: `(members, learner, active, index, task) -> State`, a task's start.
       chunk: `(members, state, index, task, time, steps) -> state, Report`, takes
         `steps` steps of all environments; the given state is used up.
       consolidate: `(members, state, index, time) -> TrainState`, the end of a task's
@@ -129,29 +129,29 @@ def build(
         key = jax.random.fold_in(jax.random.fold_in(member.keys, 1), index)
         return jax.random.split(key, 4)
 
-    def start(member, learner, alive, index, episodes):
+    def start(member, learner, active, index, episodes):
         method = make(spec, member.options)
         keys = jax.random.split(task_keys(member, index)[0], 4)
-        start_key, _, critic_key, label_key = keys
-        params, memory = method.start_task(
-            start_key, learner.params, learner.memory, index
+        start_key, _, critic_key, extras_key = keys
+        params, method_state = method.start_task(
+            start_key, learner.params, learner.method_state, index
         )
-        learner = learner._replace(params=params, memory=memory)
+        learner = learner._replace(params=params, method_state=method_state)
         if method.fresh_critic:
-            critic = sac.init_critic(critic_key, spec, method.extra)
+            critic = sac.init_critic(critic_key, spec, method.critic_extra)
             learner = learner._replace(critic=critic)
-        label = method.label(label_key, memory, None, episodes.steps)
+        extras = method.extras(extras_key, method_state, None, episodes.steps)
         buffer = replay_buffer.create(
             episodes.state.observation,
             transitions=shape.transitions,
             actions=spec.actions,
             episode_length=environment.episode_length,
-            label=label,
+            extras=extras,
         )
         learner = sac.restart(learner, member.sac)
-        acting = (learner.params, learner.memory) if shape.overlap else ()
+        acting = (learner.params, learner.method_state) if shape.overlap else ()
         return RunnerState(
-            learner, CollectorState(buffer, episodes, label), alive, acting
+            learner, CollectorState(buffer, episodes, extras), active, acting
         )
 
     def consolidate(member, state, index, time):
@@ -169,10 +169,10 @@ def build(
             return sac.q_values(learner.critic, inputs, action)
 
         key = task_keys(member, index)[2]
-        params, memory = method.consolidate(
-            key, learner.params, learner.memory, index, Tools(sample, q)
+        params, method_state = method.consolidate(
+            key, learner.params, learner.method_state, index, Tools(sample, q)
         )
-        learner = learner._replace(params=params, memory=memory)
+        learner = learner._replace(params=params, method_state=method_state)
         return sac.restart(learner, member.sac)
 
     def offline_update(member, state, index, time, done, steps):
@@ -197,24 +197,24 @@ def build(
     def candidates(member, learner, index):
         method = make(spec, member.options)
         assert method.candidates is not None
-        return method.candidates(learner.params, learner.memory, index)
+        return method.candidates(learner.params, learner.method_state, index)
 
     def finish(member, learner, index, selection: Selection | None):
         method = make(spec, member.options)
-        params, memory = method.end_task(
-            learner.params, learner.memory, index, selection
+        params, method_state = method.end_task(
+            learner.params, learner.method_state, index, selection
         )
-        return learner._replace(params=params, memory=memory)
+        return learner._replace(params=params, method_state=method_state)
 
     def policies(member, learner):
         method = make(spec, member.options)
-        policy = functools.partial(method.policy, learner.params, learner.memory)
+        policy = functools.partial(method.policy, learner.params, learner.method_state)
         tasks = jnp.arange(spec.tasks)
         out_axes = axes(jax.eval_shape(policy, tasks[0]))
         return jax.vmap(policy, out_axes=out_axes)(tasks)
 
     def size(member, learner):
-        return make(spec, member.options).size(learner.params, learner.memory)
+        return make(spec, member.options).size(learner.params, learner.method_state)
 
     over = functools.partial(population.over, mesh)
 
@@ -265,11 +265,11 @@ def _loop(
 ) -> host_train_loop.Loop:
     """The same as `host_train_loop.loop` of an environment that is compiled, too."""
 
-    def begin(member, learner, alive, index, task):
+    def begin(member, learner, active, index, task):
         reset_key = jax.random.split(task_keys(member, index)[0], 4)[1]
         keys = jax.random.split(reset_key, shape.envs)
         episodes = jax.vmap(lambda k: rollout.begin(environment, task, k))(keys)
-        return start(member, learner, alive, index, episodes)
+        return start(member, learner, active, index, episodes)
 
     def chunk(member, state, index, task, time, steps):
         return train_loop.train(

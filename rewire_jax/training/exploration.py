@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.core.settings import SacSettings
-from rewire_jax.methods.base import Memory, Method, Params
+from rewire_jax.methods.base import Method, MethodState, Params
 from rewire_jax.nn import networks
 from rewire_jax.training import colored_noise
 
@@ -16,14 +16,14 @@ class ActionNoise(NamedTuple):
 
     Attributes:
       context: key of the method's context, `[2]` uint32.
-      label: key of the method's label, `[2]` uint32.
+      extras: key of the method's extras, `[2]` uint32.
       noise: `[envs, actions]`, of the policy's actions.
       uniform: `[envs, actions]`, actions that take no heed of the policy.
       blind: `[]` bool, whether these are taken.
     """
 
     context: jax.Array
-    label: jax.Array
+    extras: jax.Array
     noise: jax.Array
     uniform: jax.Array
     blind: jax.Array
@@ -45,14 +45,14 @@ def sample_noise(
       random: steps in the task whose actions are uniform.
       sequence: the coloured noise that `time` lies in, None where noise is white.
     """
-    context_key, action_key, random_key, label_key = jax.random.split(key, 4)
+    context_key, action_key, random_key, extras_key = jax.random.split(key, 4)
     if sequence is None:
         noise = jax.random.normal(action_key, size)
     else:
         noise = sequence[time % len(sequence)]
     return ActionNoise(
         context=jax.random.key_data(context_key),
-        label=jax.random.key_data(label_key),
+        extras=jax.random.key_data(extras_key),
         noise=noise,
         uniform=jax.random.uniform(random_key, size, minval=-1.0),
         blind=time < random,
@@ -61,8 +61,8 @@ def sample_noise(
 
 def explore(
     draw: ActionNoise,
-    acting: tuple[Params, Memory],
-    label: Any,
+    acting: tuple[Params, MethodState],
+    extras: Any,
     observation: jax.Array,
     steps: jax.Array,
     method: Method,
@@ -71,22 +71,22 @@ def explore(
 
     Args:
       draw: what is left to chance.
-      acting: the method's parameters and memory.
-      label: the method's, of the step before.
+      acting: the method's parameters and state.
+      extras: the method's, of the step before.
       observation: `[envs, observations]`.
       steps: `[envs]` int, of the running episodes.
       method: the method.
 
     Returns:
-      Actions `[envs, actions]`, and the label that belongs to the step.
+      Actions `[envs, actions]`, and the extras that belongs to the step.
     """
-    params, memory = acting
-    label_key, context_key = map(jax.random.wrap_key_data, (draw.label, draw.context))
-    label = method.label(label_key, memory, label, steps)
-    context = method.context(context_key, memory, "act", label)
-    mean, log_std = method.distribution(params, memory, context, observation)
+    params, method_state = acting
+    extras_key, context_key = map(jax.random.wrap_key_data, (draw.extras, draw.context))
+    extras = method.extras(extras_key, method_state, extras, steps)
+    context = method.context(context_key, method_state, "act", extras)
+    mean, log_std = method.distribution(params, method_state, context, observation)
     action, _ = networks.sample_action(draw.noise, mean, log_std)
-    return jnp.where(draw.blind, draw.uniform, action), label
+    return jnp.where(draw.blind, draw.uniform, action), extras
 
 
 def sample_colored(

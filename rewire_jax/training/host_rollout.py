@@ -78,18 +78,21 @@ def _play(
     """An episode in each lane: return, length, success at any and at the last step."""
     size = len(seeds)
     observation = lanes.reset(int(task.physics), seeds)
-    alive, any_, last = np.ones(size, bool), np.zeros(size, bool), np.zeros(size, bool)
+    active, any_, last = np.ones(size, bool), np.zeros(size, bool), np.zeros(size, bool)
     returns, lengths = np.zeros(size, np.float32), np.zeros(size, np.int32)
     for _ in range(environment.episode_length):
         action = np.asarray(_greedy(act)(policy, shown(observation, task, (size,))))
         moment = lanes.step(action * np.asarray(task.action_scale))
-        returns, lengths = returns + np.where(alive, moment.reward, 0), lengths + alive
-        any_, last = (
-            any_ | (alive & moment.success),
-            np.where(alive, moment.success, last),
+        returns, lengths = (
+            returns + np.where(active, moment.reward, 0),
+            lengths + active,
         )
-        alive = alive & ~moment.terminal
-        if not alive.any():
+        any_, last = (
+            any_ | (active & moment.success),
+            np.where(active, moment.success, last),
+        )
+        active = active & ~moment.terminal
+        if not active.any():
             break
         observation = moment.observation
         if moment.terminal.any():

@@ -45,14 +45,14 @@ class _Functions(NamedTuple):
 
     Attributes:
       roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
-      begin: `(members, learner, alive, index, episodes) -> State`.
+      begin: `(members, learner, active, index, episodes) -> State`.
       draws: `(members, index, time) -> exploring.Draw` `[members, every]`, of the
         next steps: drawn for each alone, they would take half of an action's time.
-      act: `(members, draws, number, acting, label, observation, steps) -> actions,
-        label`, by the draw with that number; on the CPU, where it waits for no other
+      act: `(members, draws, number, acting, extras, observation, steps) -> actions,
+        extras`, by the draw with that number; on the CPU, where it waits for no other
         device's updates.
-      store_and_update: `(members, learner, buffer, alive, index, time, played) ->
-        learner, buffer, alive, metrics`, stores `LoopConfig.every` steps and makes the
+      store_and_update: `(members, learner, buffer, active, index, time, played) ->
+        learner, buffer, active, metrics`, stores `LoopConfig.every` steps and makes the
         updates that are due after them; what is given is used up, but for the learner
         with overlap.
       inspect: `(members, learner, buffer, index, time) -> metrics`.
@@ -82,7 +82,7 @@ def loop(
       make: `member -> Method`.
       act: `Method.act`.
       task_keys: `(member, index) -> keys`, those of a task's start and steps first.
-      begin: `(member, learner, alive, index, episodes) -> State`, a task's start.
+      begin: `(member, learner, active, index, episodes) -> State`, a task's start.
       shape: sizes of the loop.
       mesh: the devices.
     """
@@ -99,17 +99,19 @@ def loop(
             environment, number, shown(observation, task, shaped)
         )
 
-    def start(members, learner, alive, index, task):
+    def start(members, learner, active, index, task):
         episodes = population.place(first(members, index, task), mesh)
-        return functions.begin(members, learner, alive, index, episodes)
+        return functions.begin(members, learner, active, index, episodes)
 
-    def state_shape(members, learner, alive, index, task):
+    def state_shape(members, learner, active, index, task):
         number = np.zeros((len(members.keys), shape.envs), np.int32)
         observation = np.zeros((*number.shape, environment.observation_size))
         episodes = host_episodes.begin(
             environment, number, observation.astype(np.float32)
         )
-        return jax.eval_shape(functions.begin, members, learner, alive, index, episodes)
+        return jax.eval_shape(
+            functions.begin, members, learner, active, index, episodes
+        )
 
     return Loop(
         begin=start,
@@ -154,26 +156,26 @@ def _compile(
 
         return jax.vmap(of)(time + jnp.arange(shape.every))
 
-    def act(members, draws, number, acting, label, observation, steps):
-        def one(member, draws, acting, label, observation, steps):
+    def act(members, draws, number, acting, extras, observation, steps):
+        def one(member, draws, acting, extras, observation, steps):
             draw = jax.tree.map(lambda leaf: leaf[number], draws)
             method = make(member)
-            return exploration.explore(draw, acting, label, observation, steps, method)
+            return exploration.explore(draw, acting, extras, observation, steps, method)
 
-        return jax.vmap(one)(members, draws, acting, label, observation, steps)
+        return jax.vmap(one)(members, draws, acting, extras, observation, steps)
 
-    def store_and_update(member, learner, buffer, alive, index, time, played):
+    def store_and_update(member, learner, buffer, active, index, time, played):
         def store(number, buffer):
-            action, label, step = jax.tree.map(lambda leaf: leaf[number], played)
+            action, extras, step = jax.tree.map(lambda leaf: leaf[number], played)
             at = time + number
-            return train_loop.store(buffer, at, action, label, step, length)
+            return train_loop.store(buffer, at, action, extras, step, length)
 
         buffer = jax.lax.fori_loop(0, shape.every, store, buffer)
         done = time + shape.every
         key = jax.random.fold_in(task_keys(member, index)[1], done - 1)
         state, metrics = train_loop.update_from_buffer(
             jax.random.split(key)[1],
-            train_loop.RunnerState(learner, CollectorState(buffer, (), ()), alive),
+            train_loop.RunnerState(learner, CollectorState(buffer, (), ()), active),
             done,
             shape.before(done),
             shape.due(done),
@@ -182,7 +184,7 @@ def _compile(
             method=make(member),
             settings=member.sac,
         )
-        return state.learner, buffer, state.alive, metrics
+        return state.learner, buffer, state.active, metrics
 
     def inspect(member, learner, buffer, index, time):
         state = train_loop.RunnerState(
@@ -229,7 +231,7 @@ def _chunk(
 ) -> tuple[train_loop.RunnerState, ChunkMetrics]:
     """Collects and learns for some steps, a multiple of `LoopConfig.every`."""
     assert steps % shape.every == 0
-    learner, (buffer, episodes, label), alive, acting = state
+    learner, (buffer, episodes, extras), active, acting = state
     episodes = jax.tree.map(np.asarray, episodes)
     lanes = open_lanes(environment, episodes.steps.size)
     roots = np.asarray(functions.roots(members, index))
@@ -238,8 +240,8 @@ def _chunk(
     task = jax.tree.map(np.asarray, task)
     cpu = jax.local_devices(backend="cpu")[0]
     here = functools.partial(jax.device_put, device=cpu)
-    actors, label = here(members), here(label)
-    acting = here(acting or (learner.params, learner.memory))
+    actors, extras = here(members), here(extras)
+    acting = here(acting or (learner.params, learner.method_state))
     learning: Any = None
     made, metrics, updates = [], [], 0
     # JAX begins what one thread asks for in turn: actions would wait for updates.
@@ -248,12 +250,12 @@ def _chunk(
             played = []
             draws = here(functions.draws(members, index, start))
             for number in range(shape.every):
-                drawn, label = functions.act(
+                drawn, extras = functions.act(
                     actors,
                     draws,
                     number,
                     acting,
-                    label,
+                    extras,
                     episodes.state.observation,
                     episodes.steps,
                 )
@@ -261,12 +263,12 @@ def _chunk(
                 episodes, step = host_episodes.advance(
                     environment, lanes, task, roots, episodes, action
                 )
-                played.append((action, jax.tree.map(np.asarray, label), step))
+                played.append((action, jax.tree.map(np.asarray, extras), step))
             along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
             made.append(along[2])
             updates += int(shape.due(start + shape.every))
             if learning:
-                learner, buffer, alive, values = learning.result()
+                learner, buffer, active, values = learning.result()
                 metrics.append(values)
             before = learner
             learning = other.submit(
@@ -274,25 +276,25 @@ def _chunk(
                 members,
                 learner,
                 buffer,
-                alive,
+                active,
                 index,
                 start,
                 along,
             )
             newest = before if shape.overlap else learning.result()[0]
-            acting = here((newest.params, newest.memory))
-        learner, buffer, alive, values = learning.result()
+            acting = here((newest.params, newest.method_state))
+        learner, buffer, active, values = learning.result()
         metrics.append(values)
     totals = jax.tree.map(lambda *values: sum(map(np.asarray, values)), *metrics)
     end = time + steps
     report = _report(made, totals, updates)._replace(
         inspected=functions.inspect(members, learner, buffer, index, end)
     )
-    episodes, label = population.place((episodes, label), mesh)
+    episodes, extras = population.place((episodes, extras), mesh)
     return train_loop.RunnerState(
         learner,
-        CollectorState(buffer, episodes, label),
-        alive,
+        CollectorState(buffer, episodes, extras),
+        active,
         population.place(acting, mesh) if shape.overlap else (),
     ), report
 

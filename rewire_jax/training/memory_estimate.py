@@ -1,7 +1,7 @@
 """What a member needs of a device's memory, known before anything is compiled.
 
 What is held is counted from shapes. What computing takes beside it is counted from the
-traced operations: the most that is alive at once, if each result is kept from where it
+traced operations: the most that is active at once, if each result is kept from where it
 is made to its last use. XLA needs less where it fuses operations, and more where it
 copies.
 """
@@ -66,9 +66,9 @@ class Need(NamedTuple):
 def _held(plan: Plan) -> tuple[Any, Any]:
     """Shapes of a learner between tasks, and of all that is held within one."""
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-    fresh = jax.eval_shape(plan.program.init, plan.members)
-    alive = jax.ShapeDtypeStruct((plan.places,), bool)
-    return fresh, plan.program.state_shape(plan.members, fresh, alive, 0, task)
+    fresh = jax.eval_shape(plan.program.init, plan.stacked)
+    active = jax.ShapeDtypeStruct((plan.num_slots,), bool)
+    return fresh, plan.program.state_shape(plan.stacked, fresh, active, 0, task)
 
 
 def check(plan: Plan) -> None:
@@ -117,11 +117,11 @@ def need(plan: Plan) -> Need:
         def roll(tasks, policies, keys):
             return rollout.episodes(environment, act, tasks, policies, keys, episodes)
 
-        keys = cut(plan.members.keys, 1, rows)
+        keys = cut(plan.stacked.keys, 1, rows)
         return size(policies) + peak(roll, cut(plan.tasks, rows), policies, keys)
 
-    member, mine = cut(plan.members), cut(state)
-    policies = jax.eval_shape(program.policies, plan.members, fresh)
+    member, mine = cut(plan.stacked), cut(state)
+    policies = jax.eval_shape(program.policies, plan.stacked, fresh)
     learner = size(mine.learner)
     work = [
         learner,  # a task's start and end each make one from the other
@@ -129,10 +129,12 @@ def need(plan: Plan) -> Need:
         play(policies, 1, settings.envs),
     ]
     if program.consolidate:
-        work.append(peak(program.consolidate, plan.members, state, 0, 1) // plan.places)
+        work.append(
+            peak(program.consolidate, plan.stacked, state, 0, 1) // plan.num_slots
+        )
     selection = 0
     if program.candidates and plan.rows:
-        chosen = jax.eval_shape(program.candidates, plan.members, fresh, 0)
+        chosen = jax.eval_shape(program.candidates, plan.stacked, fresh, 0)
         selection = play(chosen.policies, plan.rows, settings.selection_episodes)
     if program.baseline:
         work.append(selection)
@@ -174,7 +176,7 @@ def _peak(jaxpr: Jaxpr) -> int:
     }
     last |= dict.fromkeys((v for v in jaxpr.outvars if isinstance(v, Var)), -1)
     held: dict[Var, int] = {}
-    alive = most = 0
+    active = most = 0
     for index, equation in enumerate(jaxpr.eqns):
         made = {v: size(v.aval) for v in equation.outvars}
         given = sum(made.values())
@@ -182,10 +184,10 @@ def _peak(jaxpr: Jaxpr) -> int:
         if equation.primitive.name in ("scan", "while"):
             # What it carries is kept while the next is made.
             inside += given
-        most = max(most, alive + max(inside, given))
+        most = max(most, active + max(inside, given))
         held |= made
         held = {v: bytes for v, bytes in held.items() if last[v] != index}
-        alive = sum(held.values())
+        active = sum(held.values())
     return most
 
 

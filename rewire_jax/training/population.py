@@ -63,7 +63,7 @@ def cross(
 _make_keys = jax.jit(jax.vmap(jax.random.key))
 
 
-def stack(crowd: Sequence[Member]) -> Members:
+def stack(members: Sequence[Member]) -> Members:
     """Members side by side; they may differ only in their traced numbers."""
 
     def stacked(settings):
@@ -72,9 +72,9 @@ def stack(crowd: Sequence[Member]) -> Members:
         )
 
     return Members(
-        keys=_make_keys(np.array([member.seed for member in crowd], np.uint32)),
-        sac=stacked([member.sac for member in crowd]),
-        options=stacked([member.options for member in crowd]),
+        keys=_make_keys(np.array([member.seed for member in members], np.uint32)),
+        sac=stacked([member.sac for member in members]),
+        options=stacked([member.options for member in members]),
     )
 
 

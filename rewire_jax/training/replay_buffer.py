@@ -27,7 +27,7 @@ class Replay(NamedTuple):
       terminal: `[rows, envs]` bool, ended by the task.
       truncated: `[rows, envs]` bool, ended by the time limit.
       final: `[cuts, envs, observations]`.
-      label: pytree of `[rows, envs, ...]`, what a method stores beside.
+      extras: pytree of `[rows, envs, ...]`, what a method stores beside.
     """
 
     observation: jax.Array
@@ -36,7 +36,7 @@ class Replay(NamedTuple):
     terminal: jax.Array
     truncated: jax.Array
     final: jax.Array
-    label: Any = ()
+    extras: Any = ()
 
 
 def create(
@@ -45,7 +45,7 @@ def create(
     transitions: int,
     actions: int,
     episode_length: int,
-    label: Any = (),
+    extras: Any = (),
 ) -> Replay:
     """An empty buffer.
 
@@ -55,7 +55,7 @@ def create(
         observation after the last.
       actions: length of an action.
       episode_length: steps to a time limit.
-      label: pytree of `[envs, ...]`, an example of what is stored beside.
+      extras: pytree of `[envs, ...]`, an example of what is stored beside.
     """
     envs, size = first.shape
     rows = transitions + 1
@@ -67,7 +67,7 @@ def create(
         terminal=jnp.zeros((rows, envs), bool),
         truncated=jnp.zeros((rows, envs), bool),
         final=jnp.zeros((cuts, envs, size), first.dtype),
-        label=jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), label),
+        extras=jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), extras),
     )
 
 
@@ -82,7 +82,7 @@ def add(
     last: jax.Array,
     following: jax.Array,
     episode_length: int,
-    label: Any = (),
+    extras: Any = (),
 ) -> Replay:
     """Stores the transitions of one time step.
 
@@ -97,7 +97,7 @@ def add(
       following: `[envs, observations]`, the same but for ended episodes, where it
         is the first observation of the next one.
       episode_length: as in `create`.
-      label: as in `create`.
+      extras: as in `create`.
     """
     rows, cuts = replay.reward.shape[0], replay.final.shape[0]
 
@@ -113,7 +113,7 @@ def add(
         terminal=put(replay.terminal, row, terminal),
         truncated=put(replay.truncated, row, truncated),
         final=put(replay.final, cut, jnp.where(truncated[:, None], last, kept)),
-        label=jax.tree.map(lambda a, v: put(a, row, v), replay.label, label),
+        extras=jax.tree.map(lambda a, v: put(a, row, v), replay.extras, extras),
     )
 
 
@@ -133,26 +133,26 @@ def sample_indices(
     return jax.random.randint(key, shape, 0, filled * envs)
 
 
-def labels(replay: Replay, places: jax.Array, time: jax.Array) -> Any:
-    """What was stored beside the transitions at some places, see `take`."""
-    at, env = _find(replay, places, time)
+def extras_at(replay: Replay, indices: jax.Array, time: jax.Array) -> Any:
+    """What was stored beside the transitions at some indices, see `take`."""
+    at, env = _find(replay, indices, time)
     row = at % len(replay.reward)
-    return jax.tree.map(lambda a: a[row, env], replay.label)
+    return jax.tree.map(lambda a: a[row, env], replay.extras)
 
 
 def take(
-    replay: Replay, places: jax.Array, time: jax.Array, episode_length: int
+    replay: Replay, indices: jax.Array, time: jax.Array, episode_length: int
 ) -> Batch:
-    """The transitions at some places, counted from the latest back.
+    """The transitions at some indices, counted from the latest back.
 
     Args:
       replay: the buffer.
-      places: `[batch]` int, less than the number of transitions held.
+      indices: `[batch]` int, less than the number of transitions held.
       time: `[]` int, the number of time steps stored so far, at least 1.
       episode_length: as in `create`.
     """
     rows = len(replay.reward)
-    at, env = _find(replay, places, time)
+    at, env = _find(replay, indices, time)
     row = at % rows
     cut = (at // episode_length) % replay.final.shape[0]
     truncated = replay.truncated[row, env]
@@ -167,14 +167,14 @@ def take(
             replay.final[cut, env],
             replay.observation[(row + 1) % rows, env],
         ),
-        label=labels(replay, places, time),
+        extras=extras_at(replay, indices, time),
     )
 
 
-def _find(replay, places, time):
-    """Times and environments of some places."""
+def _find(replay, indices, time):
+    """Times and environments of some indices."""
     envs = replay.reward.shape[1]
-    return time - 1 - places // envs, places % envs
+    return time - 1 - indices // envs, indices % envs
 
 
 def sample(

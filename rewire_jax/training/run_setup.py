@@ -27,13 +27,13 @@ class Plan(NamedTuple):
       scenario: as it was made.
       tasks: of the sequence that is run, stacked on a leading axis, on the host.
       names: of these tasks.
-      crowd: the members.
+      members: the members.
       steps: steps of all environments in a task.
       offline_steps: after these, steps that only update from the buffer.
-      rows: places for candidates that are rolled out side by side; 0 where nothing is
+      rows: slots for candidates that are rolled out side by side; 0 where nothing is
         to be chosen.
       spec: sizes of the networks and of the sequence.
-      members: the same, stacked; fillers behind them make up the numbers.
+      stacked: the same, on a leading axis; fillers behind them make up the numbers.
       mesh: the devices.
       program: the compiled functions.
     """
@@ -42,19 +42,19 @@ class Plan(NamedTuple):
     scenario: Scenario
     tasks: Task
     names: tuple[str, ...]
-    crowd: tuple[Member, ...]
+    members: tuple[Member, ...]
     steps: int
     offline_steps: int
     rows: int
     spec: Spec
-    members: Members
+    stacked: Members
     mesh: Mesh
     program: Program
 
     @property
-    def places(self) -> int:
+    def num_slots(self) -> int:
         """Length of the members' axis."""
-        return len(self.members.keys)
+        return len(self.stacked.keys)
 
     @property
     def interactions(self) -> int:
@@ -83,17 +83,17 @@ def base_size(spec: Spec) -> int:
 def prepare(
     settings: Settings,
     scenario: Scenario | None = None,
-    crowd: Sequence[Member] = (),
-    places: int = 0,
+    members: Sequence[Member] = (),
+    num_slots: int = 0,
 ) -> Plan:
     """Checks the settings and builds what they describe; compiles nothing.
 
     Args:
       settings: of the run.
       scenario: one of your own; otherwise made from the settings.
-      crowd: the members, in place of one for each seed; their settings may differ
+      members: the members, in place of one for each seed; their settings may differ
         from the run's in traced numbers, and are not checked here.
-      places: for members; those beyond the crowd are filled.
+      num_slots: for members; those beyond the members are filled.
 
     Raises:
       UserError: a setting makes no sense.
@@ -141,17 +141,17 @@ def prepare(
     )
     sequence = scenario.tasks[: settings.tasks]
     seeds = range(settings.seed, settings.seed + settings.seeds)
-    crowd = crowd or population.cross([(settings.sac, settings.options)], seeds)
-    filled = [*crowd, *[crowd[0]] * (places - len(crowd))]
+    members = members or population.cross([(settings.sac, settings.options)], seeds)
+    filled = [*members, *[members[0]] * (num_slots - len(members))]
     mesh = population.mesh(len(filled))
-    members = population.place(population.stack(filled), mesh)
+    stacked = population.place(population.stack(filled), mesh)
     # Its numbers do not matter; runs that differ in them alone share the program.
     example = jax.tree.map(lambda _: 0.0, settings.options)
     built = compiled_functions.build(
         environment, entry.make, spec, shape, example, mesh
     )
     method = entry.make(spec, settings.options)
-    number, rows = _selection(settings, built, members, hosted)
+    number, rows = _selection(settings, built, stacked, hosted)
     budget, round_ = settings.interactions, settings.update_every * settings.envs
     if method.in_budget:
         played = number * settings.selection_episodes
@@ -167,27 +167,27 @@ def prepare(
         scenario=scenario,
         tasks=jax.tree.map(lambda *x: np.stack(x), *[t.data for t in sequence]),
         names=tuple(task.name for task in sequence),
-        crowd=tuple(crowd),
+        members=tuple(members),
         steps=budget // round_ * settings.update_every,
         offline_steps=-(
             -int(method.offline * settings.interactions) // settings.updates
         ),
         rows=rows,
         spec=spec,
-        members=members,
+        stacked=stacked,
         mesh=mesh,
         program=built,
     )
 
 
 def _selection(
-    settings: Settings, built: Program, members: Members, hosted: bool
+    settings: Settings, built: Program, stacked: Members, hosted: bool
 ) -> tuple[int, int]:
     """How many candidates there are, and the rows to play them in."""
     if built.candidates is None or not settings.selection_episodes:
         return 0, 0
-    learner = jax.eval_shape(built.init, members)
-    number = jax.eval_shape(built.candidates, members, learner, 0).valid.shape[1]
+    learner = jax.eval_shape(built.init, stacked)
+    number = jax.eval_shape(built.candidates, stacked, learner, 0).valid.shape[1]
     # Some rows for nothing, where that lets an evaluation's compiled function serve.
     same = settings.selection_episodes == settings.eval_episodes
     return number, max(number, settings.tasks) if same and not hosted else number

@@ -9,7 +9,7 @@ import optax
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
-from rewire_jax.methods.base import Memory, Method, Params, Spec
+from rewire_jax.methods.base import Method, MethodState, Params, Spec
 from rewire_jax.nn import networks
 
 Metrics = dict[str, jax.Array]
@@ -22,7 +22,7 @@ class TrainState(NamedTuple):
 
     Attributes:
       params: the method's parameters.
-      memory: the method's memory.
+      method_state: what the method carries from task to task.
       critic: layers of both critics, stacked on a leading axis of 2.
       target: the same, moving slowly after them.
       log_temperature: `[]`.
@@ -30,7 +30,7 @@ class TrainState(NamedTuple):
     """
 
     params: Params
-    memory: Memory
+    method_state: MethodState
     critic: Any
     target: Any
     log_temperature: jax.Array
@@ -40,10 +40,11 @@ class TrainState(NamedTuple):
 def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainState:
     """A learner before its first task."""
     policy_key, critic_key = jax.random.split(key)
-    params, memory = method.init(policy_key)
-    critic = init_critic(critic_key, spec, method.extra)
+    params, method_state = method.init(policy_key)
+    critic = init_critic(critic_key, spec, method.critic_extra)
     return restart(
-        TrainState(params, memory, critic, critic, jnp.zeros(()), ((), (), ())), sac
+        TrainState(params, method_state, critic, critic, jnp.zeros(()), ((), (), ())),
+        sac,
     )
 
 
@@ -99,8 +100,8 @@ class UpdateNoise(NamedTuple):
 
 def sample_noise(
     key: jax.Array,
-    memory: Memory,
-    label: Any,
+    method_state: MethodState,
+    extras: Any,
     size: tuple[int, int],
     method: Method,
     sac: SacSettings,
@@ -109,19 +110,19 @@ def sample_noise(
 
     Args:
       key: a random key.
-      memory: the method's, which updates leave as it is.
-      label: of the update's transitions.
+      method_state: the method's, which updates leave as it is.
+      extras: of the update's transitions.
       size: of its actions, `batch, actions`.
       method: the method.
       sac: SAC's settings.
     """
     critic_key, policy_key, noise_key, penalty_key = jax.random.split(key, 4)
     states = _STATES[sac.policy_states]
-    acting = jax.tree.map(lambda x: jnp.concatenate([x] * states), label)
+    acting = jax.tree.map(lambda x: jnp.concatenate([x] * states), extras)
     return UpdateNoise(
         contexts=(
-            method.context(critic_key, memory, "critic", label),
-            method.context(policy_key, memory, "policy", acting),
+            method.context(critic_key, method_state, "critic", extras),
+            method.context(policy_key, method_state, "policy", acting),
         ),
         noise=jax.random.normal(noise_key, (1 + states, *size)),
         penalty=penalty_key,
@@ -131,7 +132,7 @@ def sample_noise(
 def _critic_loss(critic, learner, batch, draw, method, sac):
     context = draw.contexts[0]
     mean, log_std = method.distribution(
-        learner.params, learner.memory, context, batch.next_observation
+        learner.params, learner.method_state, context, batch.next_observation
     )
     action, log_density = networks.sample_action(draw.noise[0], mean, log_std)
     following = method.critic_input(context, batch.next_observation)
@@ -145,26 +146,26 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     target = sac.reward_scale * batch.reward
     target += sac.discount * jnp.where(ended, 0.0, soft_value)
     # The action that was taken is valued by what was stored with it.
-    inputs = method.critic_input(batch.label, batch.observation)
+    inputs = method.critic_input(batch.extras, batch.observation)
     q = q_values(critic, inputs, batch.action)
     error = q - jax.lax.stop_gradient(target)
     return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
 
 
 def _policy_loss(params, learner, batch, draw, method, sac):
-    memory, context = learner.memory, draw.contexts[1]
+    method_state, context = learner.method_state, draw.contexts[1]
     observation = batch.observation
     if sac.policy_states == "both":
         observation = jnp.concatenate([observation, batch.next_observation])
     noise = draw.noise[1:].reshape(-1, draw.noise.shape[-1])
-    gaussian = method.distribution(params, memory, context, observation)
+    gaussian = method.distribution(params, method_state, context, observation)
     action, log_density = networks.sample_action(noise, *gaussian)
     inputs = method.critic_input(context, observation)
     q = jnp.min(q_values(learner.critic, inputs, action), axis=0)
     entropy = -jnp.mean(log_density)
     loss = -jnp.exp(learner.log_temperature) * entropy - jnp.mean(q)
     penalty, metrics = method.penalty(
-        draw.penalty, params, memory, context, observation, gaussian
+        draw.penalty, params, method_state, context, observation, gaussian
     )
     return loss + penalty, {"policy_loss": loss, "entropy": entropy} | metrics
 
@@ -188,7 +189,7 @@ def _update_policy(actor, learner, batch, draw, method, sac):
     )
     policy_state, temperature_state = actor.optimizers
     updates, policy_state = _step(gradient, policy_state, actor.params, sac.lr_policy)
-    updates = method.adjust_updates(updates, learner.memory)
+    updates = method.adjust_updates(updates, learner.method_state)
     actions = batch.action.shape[-1]
     surplus = metrics["entropy"] + sac.target_multiplier * actions
     # d/d log_temperature of temperature * (entropy - target entropy)

@@ -49,12 +49,12 @@ class CollectorState(NamedTuple):
     Attributes:
       buffer: the replay buffer.
       episodes: `[envs]` environments.
-      label: the method's, of the latest step.
+      extras: the method's, of the latest step.
     """
 
     buffer: replay_buffer.Replay
     episodes: rollout.Episode
-    label: Any
+    extras: Any
 
 
 class RunnerState(NamedTuple):
@@ -63,13 +63,14 @@ class RunnerState(NamedTuple):
     Attributes:
       learner: all that learning changes.
       collection: all that collecting changes.
-      alive: `[]` bool; once a value is not finite the learner is updated no more.
-      acting: parameters and memory that act next, with `LoopConfig.overlap`; else `()`.
+      active: `[]` bool; once a value is not finite the learner is updated no more.
+      acting: parameters and method's state that act next, with `LoopConfig.overlap`;
+        else `()`.
     """
 
     learner: sac.TrainState
     collection: CollectorState
-    alive: jax.Array
+    active: jax.Array
     acting: Any = ()
 
 
@@ -119,12 +120,12 @@ def collect(
     sequence: jax.Array | None,
 ) -> tuple[CollectorState, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
-    learner, (buffer, episodes, label), *_ = state
+    learner, (buffer, episodes, extras), *_ = state
     size = shape.envs, environment.action_size
-    action, label = exploration.explore(
+    action, extras = exploration.explore(
         exploration.sample_noise(key, time, size, shape.random, sequence),
-        (learner.params, learner.memory),
-        label,
+        (learner.params, learner.method_state),
+        extras,
         episodes.state.observation,
         episodes.steps,
         method,
@@ -141,15 +142,15 @@ def collect(
         episodes = episodes._replace(start=starts)
     advance = functools.partial(rollout.advance, environment, task)
     episodes, step = jax.vmap(advance)(episodes, action)
-    buffer = store(buffer, time, action, label, step, length)
-    return CollectorState(buffer, episodes, label), step
+    buffer = store(buffer, time, action, extras, step, length)
+    return CollectorState(buffer, episodes, extras), step
 
 
 def store(
     buffer: replay_buffer.Replay,
     time: jax.Array,
     action: jax.Array,
-    label: Any,
+    extras: Any,
     step: rollout.Step,
     episode_length: int,
 ) -> replay_buffer.Replay:
@@ -164,7 +165,7 @@ def store(
         last=step.last,
         following=step.following,
         episode_length=episode_length,
-        label=label,
+        extras=extras,
     )
 
 
@@ -200,21 +201,21 @@ def update_from_buffer(
     size = settings.batch_size, environment.action_size
 
     def learned(learner):
-        places_key, draw_key = jax.random.split(key)
-        places = replay_buffer.sample_indices(
-            buffer, places_key, time, (updates, size[0])
+        indices_key, draw_key = jax.random.split(key)
+        indices = replay_buffer.sample_indices(
+            buffer, indices_key, time, (updates, size[0])
         )
         draws = jax.vmap(
-            lambda key, label: sac.sample_noise(
-                key, learner.memory, label, size, method, settings
+            lambda key, extras: sac.sample_noise(
+                key, learner.method_state, extras, size, method, settings
             )
         )(
             jax.random.split(draw_key, updates),
-            replay_buffer.labels(buffer, places, time),
+            replay_buffer.extras_at(buffer, indices, time),
         )
 
         def batch(number):
-            return replay_buffer.take(buffer, places[number], time, length)
+            return replay_buffer.take(buffer, indices[number], time, length)
 
         return sac.updates(learner, draws, batch, first, updates, method, settings)
 
@@ -225,11 +226,11 @@ def update_from_buffer(
         lambda _, carry: learned(carry[0]),
         (state.learner, sac.no_metrics(learned, state.learner)),
     )
-    alive = state.alive & all_finite(
+    active = state.active & all_finite(
         (learner.params, learner.critic, learner.log_temperature)
     )
-    learner = select(alive, learner, state.learner)
-    return state._replace(learner=learner, alive=alive), metrics
+    learner = select(active, learner, state.learner)
+    return state._replace(learner=learner, active=active), metrics
 
 
 def train(
@@ -338,4 +339,4 @@ def inspect(
     batch_key = jax.random.split(jax.random.fold_in(key, time), 3)[2]
     buffer, learner = state.collection.buffer, state.learner
     batch = replay_buffer.sample(buffer, batch_key, time, settings.batch_size, length)
-    return method.inspect(learner.params, learner.memory, batch.observation)
+    return method.inspect(learner.params, learner.method_state, batch.observation)

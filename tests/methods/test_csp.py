@@ -31,8 +31,8 @@ OBSERVATION = OBSERVATION.astype(np.float32)
 def call(name, purpose, options, *arguments):
     method = csp.csp(SPEC, options)
     if purpose:
-        key, memory, label = arguments
-        return method.context(key, memory, purpose, label)
+        key, state, extras = arguments
+        return method.context(key, state, purpose, extras)
     return getattr(method, name)(*arguments)
 
 
@@ -40,10 +40,10 @@ def make(**values):
     """The method, compiled; as in a run, its numbers are traced."""
     options = CspSettings(**SEARCH | values).checked()
     method = csp.csp(SPEC, options)
-    traced = ("init", "distribution", "policy", "label", "candidates", "end_task")
+    traced = ("init", "distribution", "policy", "extras", "candidates", "end_task")
 
-    def context(key, memory, purpose, label):
-        return call("context", purpose, options, key, memory, label)
+    def context(key, state, purpose, extras):
+        return call("context", purpose, options, key, state, extras)
 
     return method._replace(
         context=context,
@@ -61,7 +61,7 @@ def random_anchors(rng, number=TASKS):
 def in_training(rng, frozen, **values):
     """The method in a task that began with some frozen anchors, and these."""
     method = make(**values)
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     anchors = random_anchors(rng)
     params = jax.tree.map(lambda x: x[frozen], anchors)
 
@@ -72,7 +72,7 @@ def in_training(rng, frozen, **values):
     return (
         method,
         params,
-        memory._replace(
+        state._replace(
             learned=jnp.int32(frozen),
             frozen=jnp.int32(frozen),
             anchors=jax.tree.map(cut, anchors),
@@ -174,9 +174,9 @@ PEAKED = ("forgetting", "transfer")
 def test_an_anchor_has_the_width_asked_for():
     for width, expected in [(0, 5), (9, 9)]:
         method = make(width=width)
-        params, memory = method.init(KEY)
+        params, state = method.init(KEY)
         assert [layer.bias.size for layer in params] == [expected] * 2 + [2 * ACTIONS]
-        assert method.size(params, memory) == count(params)
+        assert method.size(params, state) == count(params)
 
 
 # Weights
@@ -204,67 +204,67 @@ def assert_dirichlet(weights, concentration):
 @pytest.mark.parametrize("distribution", ["flat", "peaked"])
 def test_half_of_the_environments_draw_from_each_simplex(distribution):
     for frozen in range(TASKS):
-        method, _, memory, _ = in_training(
+        method, _, state, _ = in_training(
             np.random.default_rng(1), frozen, distribution=distribution
         )
         key = jax.random.key(frozen)
-        weights = method.label(key, memory, None, np.zeros(8000, int))
+        weights = method.extras(key, state, None, np.zeros(8000, int))
         last = (frozen + 1) ** 2 if distribution == "peaked" else 1
         assert_dirichlet(weights[:4000], [1] * frozen + [last])
         assert_dirichlet(weights[4000:], [1] * max(frozen, 1))
-        policy = method.context(key, memory, "policy", weights)
+        policy = method.context(key, state, "policy", weights)
         assert policy.shape == weights.shape
         assert_dirichlet(policy, [1] * frozen + [last])
         # Fresh draws are neither the stored ones nor alike from key to key.
-        other = method.context(jax.random.key(9), memory, "policy", weights)
+        other = method.context(jax.random.key(9), state, "policy", weights)
         if frozen:
             assert len(np.unique(weights[:4000], axis=0)) > 3990
             assert np.mean(np.all(policy == other, axis=-1)) < 0.01
 
 
 def test_the_odd_environment_draws_from_the_new_simplex():
-    method, _, memory, _ = in_training(np.random.default_rng(1), 2)
+    method, _, state, _ = in_training(np.random.default_rng(1), 2)
     for envs, new in [(1, 1), (3, 2)]:
-        weights = method.label(KEY, memory, None, np.zeros(envs, int))
+        weights = method.extras(KEY, state, None, np.zeros(envs, int))
         np.testing.assert_array_equal(weights[:, 2] > 0, np.arange(envs) < new)
 
 
 def test_weights_are_held_between_draws():
-    method, _, memory, _ = in_training(np.random.default_rng(1), 2, resample_every=20)
+    method, _, state, _ = in_training(np.random.default_rng(1), 2, resample_every=20)
     held = random_weights(np.random.default_rng(2), 8, 3)
     steps = np.array([0, 1, 19, 20, 21, 39, 40, 999])
-    weights = method.label(KEY, memory, held, steps)
+    weights = method.extras(KEY, state, held, steps)
     drawn = np.any(weights != held, axis=-1)
     np.testing.assert_array_equal(drawn, np.isin(steps, [0, 20, 40]))
     assert_on_simplex(weights, 3)
     # All start anew in the first step, whatever was before.
-    fresh = method.label(jax.random.key(1), memory, held, np.zeros(8, int))
+    fresh = method.extras(jax.random.key(1), state, held, np.zeros(8, int))
     assert np.all(np.any(fresh != held, axis=-1))
 
 
 def test_critics_see_the_stored_weights():
-    method, _, memory, _ = in_training(np.random.default_rng(1), 1)
-    label = random_weights(np.random.default_rng(2), 7, 2)
+    method, _, state, _ = in_training(np.random.default_rng(1), 1)
+    extras = random_weights(np.random.default_rng(2), 7, 2)
     for purpose in ("act", "critic"):
-        assert_same(method.context(KEY, memory, purpose, label), jnp.array(label))
-    seen = method.critic_input(label, OBSERVATION)
-    assert seen.shape == (7, OBSERVATIONS + method.extra)
+        assert_same(method.context(KEY, state, purpose, extras), jnp.array(extras))
+    seen = method.critic_input(extras, OBSERVATION)
+    assert seen.shape == (7, OBSERVATIONS + method.critic_extra)
     np.testing.assert_array_equal(seen[:, :OBSERVATIONS], OBSERVATION)
-    np.testing.assert_array_equal(seen[:, OBSERVATIONS:], label)
+    np.testing.assert_array_equal(seen[:, OBSERVATIONS:], extras)
     assert method.fresh_critic
 
 
 def test_the_authors_critics_see_redrawn_weights_at_the_next_action():
-    method, _, memory, _ = in_training(
+    method, _, state, _ = in_training(
         np.random.default_rng(1), 1, next_weights="redrawn"
     )
-    label = random_weights(np.random.default_rng(2), 500, 2)
-    drawn = method.context(KEY, memory, "critic", label)
-    assert drawn.shape == label.shape
-    assert not np.any(np.all(np.isclose(drawn, label), axis=-1))
+    extras = random_weights(np.random.default_rng(2), 500, 2)
+    drawn = method.context(KEY, state, "critic", extras)
+    assert drawn.shape == extras.shape
+    assert not np.any(np.all(np.isclose(drawn, extras), axis=-1))
     assert_on_simplex(drawn, 2)
-    same = method.context(jax.random.key(1), memory, "act", label)
-    assert_same(same, jnp.array(label))
+    same = method.context(jax.random.key(1), state, "act", extras)
+    assert_same(same, jnp.array(extras))
 
 
 # The mixture
@@ -273,24 +273,24 @@ def test_the_authors_critics_see_redrawn_weights_at_the_next_action():
 @pytest.mark.parametrize("frozen", [0, 1, 3])
 def test_distribution_mixes_the_layers_for_each_sample(frozen):
     rng = np.random.default_rng(3)
-    method, params, memory, anchors = in_training(rng, frozen)
+    method, params, state, anchors = in_training(rng, frozen)
     weights = random_weights(rng, 7, frozen + 1)
-    got = method.distribution(params, memory, weights, OBSERVATION)
+    got = method.distribution(params, state, weights, OBSERVATION)
     expected = [play(anchors, *pair) for pair in zip(weights, OBSERVATION, strict=True)]
     for values, rows in zip(got, zip(*expected, strict=True), strict=True):
         assert_near(values, np.stack(rows))
-    one = method.distribution(params, memory, weights[2], OBSERVATION[2])
+    one = method.distribution(params, state, weights[2], OBSERVATION[2])
     assert_near(one, expected[2])
 
 
 def test_weights_shared_by_a_batch_make_one_plain_policy():
     rng = np.random.default_rng(4)
-    method, params, memory, anchors = in_training(rng, 2)
+    method, params, state, anchors = in_training(rng, 2)
     for row in random_weights(rng, 3, 3):
         shared = np.broadcast_to(row, (7, TASKS))
         plain = jax.tree.map(jnp.float32, folded(anchors, row))
         assert_near(
-            method.distribution(params, memory, shared, OBSERVATION),
+            method.distribution(params, state, shared, OBSERVATION),
             networks.mlp_policy(plain, OBSERVATION),
         )
         assert_near(jax.jit(csp.fold)(anchors, row), plain)
@@ -299,7 +299,7 @@ def test_weights_shared_by_a_batch_make_one_plain_policy():
 @pytest.mark.parametrize("frozen", [0, 2])
 def test_the_gradient_is_that_of_the_newest_anchor(frozen):
     rng = np.random.default_rng(5)
-    method, params, memory, anchors = in_training(rng, frozen)
+    method, params, state, anchors = in_training(rng, frozen)
     weights = random_weights(rng, 7, frozen + 1)
 
     def loss(gaussian):
@@ -323,7 +323,7 @@ def test_the_gradient_is_that_of_the_newest_anchor(frozen):
     @jax.jit
     @jax.grad
     def ours(params):
-        return loss(method.distribution(params, memory, weights, OBSERVATION))
+        return loss(method.distribution(params, state, weights, OBSERVATION))
 
     expected = jax.tree.map(lambda x: x[frozen], brute(anchors))
     assert_near(ours(params), expected, 1e-4)
@@ -342,7 +342,7 @@ def batch_of(observation):
 @pytest.mark.parametrize("frozen", [1, 3])
 def test_the_search_proposes_the_best_of_either_simplex(frozen):
     rng = np.random.default_rng(6)
-    method, params, memory, _ = in_training(rng, frozen)
+    method, params, state, _ = in_training(rng, frozen)
     slope = rng.normal(size=TASKS).astype(np.float32)
     weights, noise = [], []
 
@@ -355,7 +355,7 @@ def test_the_search_proposes_the_best_of_either_simplex(frozen):
         value = context @ slope + observation[:, 0]
         return jnp.stack([value, -100 * value])
 
-    kept, memory = method.consolidate(KEY, params, memory, frozen, Tools(sample, q))
+    kept, state = method.consolidate(KEY, params, state, frozen, Tools(sample, q))
     jax.effects_barrier()
     assert_same(kept, params)
     assert len(noise) == SEARCH["estimations"]
@@ -364,7 +364,7 @@ def test_the_search_proposes_the_best_of_either_simplex(frozen):
     value = drawn @ slope + np.mean(noise, axis=0)
     halves = np.split(np.arange(len(value)), 2)
     best = [half[np.argsort(-value[half])[:2]] for half in halves]
-    np.testing.assert_array_equal(memory.proposals, drawn[np.concatenate(best)])
+    np.testing.assert_array_equal(state.proposals, drawn[np.concatenate(best)])
     for half, used in zip(halves, (frozen + 1, frozen), strict=True):
         assert len(half) == SEARCH["samples"]
         assert_on_simplex(drawn[half], used)
@@ -372,7 +372,7 @@ def test_the_search_proposes_the_best_of_either_simplex(frozen):
 
 
 def test_the_search_draws_flatly():
-    method, params, memory, _ = in_training(
+    method, params, state, _ = in_training(
         np.random.default_rng(7), 2, samples=4000, estimations=1, distribution="peaked"
     )
     seen = []
@@ -384,7 +384,7 @@ def test_the_search_draws_flatly():
     def sample(key, number):
         return batch_of(jnp.zeros((number, OBSERVATIONS)))
 
-    method.consolidate(KEY, params, memory, 2, Tools(sample, q))
+    method.consolidate(KEY, params, state, 2, Tools(sample, q))
     assert_dirichlet(seen[0][:4000], [1, 1, 1])
     assert_dirichlet(seen[0][4000:], [1, 1])
 
@@ -392,10 +392,10 @@ def test_the_search_draws_flatly():
 def test_candidates_are_the_proposals_folded():
     rng = np.random.default_rng(8)
     for frozen in (0, 1, 3):
-        method, params, memory, anchors = in_training(rng, frozen)
-        policies, valid = method.candidates(params, memory, frozen)
+        method, params, state, anchors = in_training(rng, frozen)
+        policies, valid = method.candidates(params, state, frozen)
         np.testing.assert_array_equal(valid, [frozen > 0] * SEARCH["rollouts"])
-        for index, row in enumerate(memory.proposals):
+        for index, row in enumerate(state.proposals):
             policy = jax.tree.map(lambda x, i=index: x[i], policies)
             assert_near(policy, folded(anchors, row))
     assert method.in_budget
@@ -426,21 +426,21 @@ def test_an_anchor_is_kept_if_it_helps(after, kept, chosen):
     method, params, before, anchors = in_training(
         np.random.default_rng(9), 2, improvement=0.5
     )
-    following, memory = method.end_task(params, before, 2, selection(*after))
-    assert memory.learned == 3
-    assert memory.frozen == 2 + kept
-    assert method.size(following, memory) == (2 + kept) * count(params)
-    np.testing.assert_array_equal(memory.best[2], before.proposals[chosen])
+    following, state = method.end_task(params, before, 2, selection(*after))
+    assert state.learned == 3
+    assert state.frozen == 2 + kept
+    assert method.size(following, state) == (2 + kept) * count(params)
+    np.testing.assert_array_equal(state.best[2], before.proposals[chosen])
     used = anchors if kept else before.anchors
-    for ours, theirs in zip(memory.anchors, used, strict=True):
+    for ours, theirs in zip(state.anchors, used, strict=True):
         assert_same(Linear(*(x[:3] for x in ours)), Linear(*(x[:3] for x in theirs)))
     even = (np.arange(TASKS) < 2 + kept) / (2 + kept)
     assert_near(following, folded(anchors, even))
     # A dropped anchor is nowhere, and the next one takes its slot.
-    traces = np.concatenate([np.ravel(x) for x in jax.tree.leaves((following, memory))])
+    traces = np.concatenate([np.ravel(x) for x in jax.tree.leaves((following, state))])
     assert np.isin(params[1].weight, traces).all() == kept
     newer = jax.tree.map(lambda x: x + 1, params)
-    _, later = method.end_task(newer, memory, 3, selection(9.0, 0.0, 0.0, 0.0))
+    _, later = method.end_task(newer, state, 3, selection(9.0, 0.0, 0.0, 0.0))
     assert later.frozen == 3 + kept
     assert_same(jax.tree.map(lambda x: x[2 + kept], later.anchors), newer)
 
@@ -448,21 +448,21 @@ def test_an_anchor_is_kept_if_it_helps(after, kept, chosen):
 @pytest.mark.parametrize("after", [None, (0.0, 0.0, 5.0, 5.0), (NAN,) * 4])
 def test_the_first_anchor_is_always_kept(after):
     method = make()
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     chosen = after if after is None else selection(*after)
-    following, memory = method.end_task(params, memory, 0, chosen)
-    assert (memory.learned, memory.frozen) == (1, 1)
-    np.testing.assert_array_equal(memory.best[0], [1, 0, 0, 0])
+    following, state = method.end_task(params, state, 0, chosen)
+    assert (state.learned, state.frozen) == (1, 1)
+    np.testing.assert_array_equal(state.best[0], [1, 0, 0, 0])
     assert_same(following, params)
-    assert_same(method.policy(following, memory, 0), params)
+    assert_same(method.policy(following, state, 0), params)
 
 
 def test_without_selection_the_newest_anchor_is_the_policy():
-    method, params, memory, _ = in_training(np.random.default_rng(10), 2)
-    following, memory = method.end_task(params, memory, 2, None)
-    assert memory.frozen == 3
-    np.testing.assert_array_equal(memory.best[2], [0, 0, 1, 0])
-    assert_same(method.policy(following, memory, 2), params)
+    method, params, state, _ = in_training(np.random.default_rng(10), 2)
+    following, state = method.end_task(params, state, 2, None)
+    assert state.frozen == 3
+    np.testing.assert_array_equal(state.best[2], [0, 0, 1, 0])
+    assert_same(method.policy(following, state, 2), params)
 
 
 # Policies of tasks
@@ -471,51 +471,51 @@ def test_without_selection_the_newest_anchor_is_the_policy():
 def test_policies_of_finished_tasks_never_change():
     rng = np.random.default_rng(11)
     method = make()
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     for task in range(TASKS):
-        assert_same(method.policy(params, memory, task), params)
+        assert_same(method.policy(params, state, task), params)
     policies, returns = [], [(9.0, 0.0, 1.0, 1.0), (0.0, 0.0, 5.0, 1.0)]
     for task in range(TASKS):
         params = jax.tree.map(
             lambda x: x + rng.normal(size=x.shape).astype(np.float32), params
         )
-        frozen = int(memory.frozen)
+        frozen = int(state.frozen)
         proposals = random_weights(rng, 4, frozen + 1)
         proposals[2:] = random_weights(rng, 2, max(frozen, 1))
-        memory = memory._replace(proposals=proposals)
+        state = state._replace(proposals=proposals)
         # The anchors of the second and the last task are kept, not the third's.
-        params, memory = method.end_task(
-            params, memory, task, selection(*returns[task == 2])
+        params, state = method.end_task(
+            params, state, task, selection(*returns[task == 2])
         )
-        weights = memory.best[task]
-        policies.append(method.policy(params, memory, task))
-        assert_near(policies[-1], folded(memory.anchors, weights))
-        unused = np.arange(TASKS) >= int(memory.frozen)
-        assert_on_simplex(weights, int(memory.frozen))
-        planted = memory._replace(
+        weights = state.best[task]
+        policies.append(method.policy(params, state, task))
+        assert_near(policies[-1], folded(state.anchors, weights))
+        unused = np.arange(TASKS) >= int(state.frozen)
+        assert_on_simplex(weights, int(state.frozen))
+        planted = state._replace(
             anchors=jax.tree.map(
                 lambda x, u=unused: np.where(
                     u.reshape(-1, *[1] * (x.ndim - 1)), np.float32(np.nan), x
                 ),
-                memory.anchors,
+                state.anchors,
             )
         )
-        for one in (memory, planted):
+        for one in (state, planted):
             for known, policy in enumerate(policies):
                 assert_same(method.policy(params, one, known), policy)
             for unseen in range(task + 1, TASKS):
                 assert_same(method.policy(params, one, unseen), policies[-1])
-    assert memory.frozen == 3
+    assert state.frozen == 3
 
 
 def test_a_diverged_anchor_leaves_older_policies_alone():
-    method, params, memory, _ = in_training(np.random.default_rng(12), 1)
+    method, params, state, _ = in_training(np.random.default_rng(12), 1)
     best = np.eye(TASKS, dtype=np.float32)
-    memory = memory._replace(best=best)
-    before = method.policy(params, memory, 0)
+    state = state._replace(best=best)
+    before = method.policy(params, state, 0)
     broken = jax.tree.map(lambda x: x * np.nan, params)
-    following, memory = method.end_task(broken, memory, 1, None)
-    assert_same(method.policy(following, memory, 0), before)
+    following, state = method.end_task(broken, state, 1, None)
+    assert_same(method.policy(following, state, 0), before)
 
 
 # Members
@@ -533,23 +533,23 @@ def test_a_member_is_the_same_alone_and_in_a_crowd():
         )
 
         def one_task(carry, task):
-            params, memory, label = carry
+            params, state, extras = carry
             draw_key, search_key = jax.random.split(jax.random.fold_in(key, task))
-            label = method.label(draw_key, memory, label, jnp.array([1, 2]))
-            outputs = method.distribution(params, memory, label, OBSERVATION[:2])
+            extras = method.extras(draw_key, state, extras, jnp.array([1, 2]))
+            outputs = method.distribution(params, state, extras, OBSERVATION[:2])
             params = jax.tree.map(lambda x: x * 1.1 + 0.01, params)
-            params, memory = method.consolidate(search_key, params, memory, task, tools)
-            proposed = method.candidates(params, memory, task)
+            params, state = method.consolidate(search_key, params, state, task, tools)
+            proposed = method.candidates(params, state, task)
             returns = selection(1.3, 1.2, 1.0, 0.9)
-            params, memory = method.end_task(params, memory, task, returns)
+            params, state = method.end_task(params, state, task, returns)
             policies = jax.vmap(method.policy, (None, None, 0))
-            learned = policies(params, memory, jnp.arange(TASKS))
-            seen = label, outputs, proposed, learned, method.size(params, memory)
-            return (params, memory, label), seen
+            learned = policies(params, state, jnp.arange(TASKS))
+            seen = extras, outputs, proposed, learned, method.size(params, state)
+            return (params, state, extras), seen
 
-        params, memory = method.init(key)
-        label = method.label(key, memory, None, jnp.zeros(2, int))
-        return jax.lax.scan(one_task, (params, memory, label), jnp.arange(3))
+        params, state = method.init(key)
+        extras = method.extras(key, state, None, jnp.zeros(2, int))
+        return jax.lax.scan(one_task, (params, state, extras), jnp.arange(3))
 
     def options(improvement, every):
         return CspSettings(

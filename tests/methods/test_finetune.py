@@ -30,15 +30,15 @@ def changed(rng, params):
 
 
 def run(method, tasks, seed=0):
-    """Parameters, memory and each task's trained policy after some tasks."""
+    """Parameters, state and each task's trained policy after some tasks."""
     rng, own = np.random.default_rng(seed), []
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     for task in range(tasks):
-        params, memory = method.start_task(key(task), params, memory, task)
+        params, state = method.start_task(key(task), params, state, task)
         params = changed(rng, params)
         own.append(params)
-        params, memory = method.end_task(params, memory, task, None)
-    return params, memory, own
+        params, state = method.end_task(params, state, task, None)
+    return params, state, own
 
 
 def play(layers, observation):
@@ -63,56 +63,56 @@ def assert_all_differ(a, b):
 @pytest.mark.parametrize("name", MAKE)
 def test_training_forward_is_the_plain_policy(name):
     method = make(name)
-    params, memory, _ = run(method, 1)
-    got = method.distribution(params, memory, (), OBSERVATION)
+    params, state, _ = run(method, 1)
+    got = method.distribution(params, state, (), OBSERVATION)
     for a, b in zip(got, play(params, OBSERVATION), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)
-    assert_same(method.act(method.policy(params, memory, 0), OBSERVATION), got)
+    assert_same(method.act(method.policy(params, state, 0), OBSERVATION), got)
 
 
 @pytest.mark.parametrize("name", MAKE)
 def test_policies_of_all_tasks_after_each(name):
     method = make(name)
     for learned in range(SPEC.tasks + 1):
-        params, memory, own = run(method, learned)
+        params, state, own = run(method, learned)
         for task in range(SPEC.tasks):
             kept = name != "ft1" and task < learned
             expected = own[task] if kept else params
-            assert_same(method.policy(params, memory, task), expected)
+            assert_same(method.policy(params, state, task), expected)
 
 
 @pytest.mark.parametrize("name", ["ft_n", "sac_n"])
 def test_kept_policies_act_the_same_whatever_comes_later(name):
     method, rng = make(name), np.random.default_rng(1)
-    params, memory, own = run(method, 2)
+    params, state, own = run(method, 2)
     assert_all_differ(*own)
 
     def actions():
-        policies = [method.policy(params, memory, task) for task in range(2)]
+        policies = [method.policy(params, state, task) for task in range(2)]
         return [method.act(policy, OBSERVATION) for policy in policies]
 
     before = actions()
-    params, memory = method.start_task(key(2), params, memory, 2)
+    params, state = method.start_task(key(2), params, state, 2)
     params = changed(rng, params)
     assert_same(actions(), before)
-    params, memory = method.end_task(params, memory, 2, None)
+    params, state = method.end_task(params, state, 2, None)
     assert_same(actions(), before)
 
 
 @pytest.mark.parametrize("name", ["ft1", "ft_n"])
 def test_finetuning_starts_from_the_previous_policy(name):
     method = make(name)
-    params, memory, own = run(method, 2)
-    started, _ = method.start_task(key(2), params, memory, 2)
+    params, state, own = run(method, 2)
+    started, _ = method.start_task(key(2), params, state, 2)
     assert_same(started, own[1])
 
 
 def test_sac_n_starts_from_fresh_weights():
     method = make("sac_n")
-    params, memory, _ = run(method, 2)
+    params, state, _ = run(method, 2)
 
     def start(task, member):
-        return method.start_task(key(task, member), params, memory, task)[0]
+        return method.start_task(key(task, member), params, state, task)[0]
 
     assert_same(start(2, 0), start(2, 0))
     for other in (start(1, 0), start(2, 1), params, method.init(KEY)[0]):
@@ -136,13 +136,13 @@ def test_size_counts_the_policies_in_use(name, policies):
 def test_members_side_by_side_are_as_alone_and_traced_once(name):
     method, traces = make(name), []
 
-    def task_of_member(key, params, memory, task):
+    def task_of_member(key, params, state, task):
         traces.append(task)
-        params, memory = method.start_task(key, params, memory, task)
+        params, state = method.start_task(key, params, state, task)
         params = jax.tree.map(lambda x: x + jax.random.normal(key, x.shape), params)
-        params, memory = method.end_task(params, memory, task, None)
-        policies = [method.policy(params, memory, t) for t in range(SPEC.tasks)]
-        return params, memory, policies, method.size(params, memory)
+        params, state = method.end_task(params, state, task, None)
+        policies = [method.policy(params, state, t) for t in range(SPEC.tasks)]
+        return params, state, policies, method.size(params, state)
 
     by_itself = jax.jit(task_of_member)
     together = jax.jit(jax.vmap(task_of_member, (0, 0, 0, None)))

@@ -196,11 +196,11 @@ def test_one_trace_for_all_tasks(
 
 def test_csp_plays_what_its_search_found(trained: Callable[[str], Trained]) -> None:
     prepared = run_setup.prepare(settings("csp"), SCENARIO)
-    learner = jax.eval_shape(prepared.program.init, prepared.members)
+    learner = jax.eval_shape(prepared.program.init, prepared.stacked)
     path = run_state.kept(trained("csp").folder, None)
-    like = {"policy": (learner.params, learner.memory)}
-    _, memory = checkpoint.load(path, like)[0]["policy"]
-    for best, proposals in zip(memory.best, memory.proposals, strict=True):
+    like = {"policy": (learner.params, learner.state)}
+    _, state = checkpoint.load(path, like)[0]["policy"]
+    for best, proposals in zip(state.best, state.proposals, strict=True):
         assert (best[-1] == proposals).all(axis=1).any()
 
 
@@ -209,12 +209,12 @@ def short(method: str, seed: int, seeds: int):
     prepared = run_setup.prepare(
         dataclasses.replace(settings(method), seed=seed, seeds=seeds), SCENARIO
     )
-    program, members = prepared.program, prepared.members
-    learner, alive = program.init(members), np.ones(seeds, bool)
+    program, members = prepared.program, prepared.stacked
+    learner, active = program.init(members), np.ones(seeds, bool)
     reports = []
     for index in range(2):
         task = SCENARIO.tasks[index].data
-        state = program.begin(members, learner, alive, index, task)
+        state = program.begin(members, learner, active, index, task)
         state, report = program.chunk(members, state, index, task, 0, 24)
         reports.append(report)
         if program.consolidate:

@@ -42,12 +42,12 @@ def same(one, other):
         np.testing.assert_array_equal(a, b)
 
 
-def moved(method, params, memory, rng):
+def moved(method, params, state, rng):
     """The parameters after a random update, as the training makes it."""
     updates = jax.tree.map(
         lambda x: rng.normal(size=x.shape).astype(np.float32), params
     )
-    return jax.tree.map(jnp.add, params, method.adjust_updates(updates, memory))
+    return jax.tree.map(jnp.add, params, method.adjust_updates(updates, state))
 
 
 def played(layers, observation=OBSERVATION):
@@ -60,20 +60,20 @@ def played(layers, observation=OBSERVATION):
 
 
 def after_tasks(method, number, seed=0):
-    """Parameters and memory before and after each part of some tasks."""
+    """Parameters and state before and after each part of some tasks."""
     rng = np.random.default_rng(seed)
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     stages = {}
     for task in range(number):
-        stages[task, "start"] = params, memory
-        params = moved(method, params, memory, rng)
-        stages[task, "trained"] = params, memory
-        params, memory = method.consolidate(KEY, params, memory, task, None)
-        stages[task, "pruned"] = params, memory
-        params = moved(method, params, memory, rng)
-        stages[task, "finetuned"] = params, memory
-        params, memory = method.end_task(params, memory, task, None)
-        stages[task, "end"] = params, memory
+        stages[task, "start"] = params, state
+        params = moved(method, params, state, rng)
+        stages[task, "trained"] = params, state
+        params, state = method.consolidate(KEY, params, state, task, None)
+        stages[task, "pruned"] = params, state
+        params = moved(method, params, state, rng)
+        stages[task, "finetuned"] = params, state
+        params, state = method.end_task(params, state, task, None)
+        stages[task, "end"] = params, state
     return stages
 
 
@@ -138,9 +138,9 @@ def test_of_equal_magnitudes_the_first_are_kept():
 
 def test_updates_change_what_is_trained_and_nothing_else(method, stages):
     def trained(task, stage):
-        params, memory = stages[task, stage]
+        params, state = stages[task, stage]
         ones = jax.tree.map(jnp.ones_like, params)
-        return arrays(method.adjust_updates(ones, memory)), arrays(memory.owners)
+        return arrays(method.adjust_updates(ones, state)), arrays(state.owners)
 
     for task in range(SPEC.tasks):
         for updates, owners in zip(*trained(task, "start"), strict=True):
@@ -152,17 +152,17 @@ def test_updates_change_what_is_trained_and_nothing_else(method, stages):
 
 
 def test_updates_stay_zero_even_if_not_finite(method, stages):
-    params, memory = stages[1, "start"]
+    params, state = stages[1, "start"]
     updates = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), params)
-    adjusted = method.adjust_updates(updates, memory)
-    for update, owner in zip(arrays(adjusted), arrays(memory.owners), strict=True):
+    adjusted = method.adjust_updates(updates, state)
+    for update, owner in zip(arrays(adjusted), arrays(state.owners), strict=True):
         assert (update[owner != FREE] == 0).all()
 
 
 def test_a_learned_task_never_changes(method, stages):
     for task in range(SPEC.tasks):
-        params, memory = stages[task, "end"]
-        policy = method.policy(params, memory, task)
+        params, state = stages[task, "end"]
+        policy = method.policy(params, state, task)
         # It is what the finetuning ended with.
         same(policy, stages[task, "finetuned"][0])
         output = method.act(policy, OBSERVATION)
@@ -174,34 +174,34 @@ def test_a_learned_task_never_changes(method, stages):
 
 
 def test_tasks_are_played_by_what_they_and_those_before_own(method, stages):
-    params, memory = stages[2, "end"]
+    params, state = stages[2, "end"]
     outputs = []
     for task in range(3):
         layers = [
             np.where((owner >= 0) & (owner <= task), x, 0)
-            for x, owner in zip(arrays(params), arrays(memory.owners), strict=True)
+            for x, owner in zip(arrays(params), arrays(state.owners), strict=True)
         ]
         outputs.append(played(layers)[0])
-        actual = method.act(method.policy(params, memory, task), OBSERVATION)
+        actual = method.act(method.policy(params, state, task), OBSERVATION)
         for a, b in zip(actual, played(layers), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
     assert not np.allclose(outputs[0], outputs[1])
     assert not np.allclose(outputs[1], outputs[2])
     # A task not yet learned gets the latest.
-    same(method.policy(params, memory, 3), method.policy(params, memory, 2))
+    same(method.policy(params, state, 3), method.policy(params, state, 2))
 
 
 def test_before_training_the_policy_is_the_first_one(method):
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     for task in range(SPEC.tasks):
-        same(method.policy(params, memory, task), params)
+        same(method.policy(params, state, task), params)
 
 
 def test_training_plays_owned_and_free_weights_together(method, stages):
     for task in (0, 1):
         for stage in ("trained", "finetuned"):
-            params, memory = stages[task, stage]
-            actual = method.distribution(params, memory, (), OBSERVATION)
+            params, state = stages[task, stage]
+            actual = method.distribution(params, state, (), OBSERVATION)
             for a, b in zip(actual, played(arrays(params)), strict=True):
                 np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
@@ -209,8 +209,8 @@ def test_training_plays_owned_and_free_weights_together(method, stages):
 def test_a_full_network_stays_as_it_is():
     method = make(keep=0.5)
     stages = after_tasks(method, 4)
-    params, memory = stages[1, "end"]
-    assert all((owner != FREE).all() for owner in arrays(memory.owners))
+    params, state = stages[1, "end"]
+    assert all((owner != FREE).all() for owner in arrays(state.owners))
     for task in (2, 3):
         same(stages[task, "end"][0], params)
         same(method.policy(*stages[task, "end"], task), params)
@@ -227,18 +227,18 @@ def test_members_differ_in_their_share_and_are_the_same_alone():
 
     def member(keep, key):
         method = packnet.packnet(SPEC, PackNetSettings(keep=keep))
-        params, memory = method.init(key)
-        params, memory = method.consolidate(key, params, memory, 0, None)
-        params, memory = method.end_task(params, memory, 0, None)
-        return method.policy(params, memory, 0), memory
+        params, state = method.init(key)
+        params, state = method.consolidate(key, params, state, 0, None)
+        params, state = method.end_task(params, state, 0, None)
+        return method.policy(params, state, 0), state
 
     keys = jax.random.split(KEY, 2)
     crowd = jax.jit(jax.vmap(member))(shares, keys)
     alone = jax.jit(member)
     for number, keep in enumerate(shares):
-        policy, memory = one = alone(keep, keys[number])
+        policy, state = one = alone(keep, keys[number])
         same(one, jax.tree.map(operator.itemgetter(number), crowd))
-        for x, owner in zip(arrays(policy), arrays(memory.owners), strict=True):
+        for x, owner in zip(arrays(policy), arrays(state.owners), strict=True):
             assert np.sum(owner == 0) == np.ceil(keep * x.size)
             assert np.sum(x != 0) == np.sum(owner == 0)
 

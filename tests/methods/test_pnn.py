@@ -71,8 +71,8 @@ def played(columns, observation=OBSERVATION):
     return x[:, :2], np.clip(x[:, 2:], -20, 2)
 
 
-def loss(params, memory, observation=OBSERVATION):
-    mean, log_std = PLAIN.distribution(params, memory, (), observation)
+def loss(params, state, observation=OBSERVATION):
+    mean, log_std = PLAIN.distribution(params, state, (), observation)
     return jnp.sum(jnp.sin(mean)) + jnp.sum(log_std**2)
 
 
@@ -81,18 +81,18 @@ slopes = jax.jit(jax.grad(loss, argnums=(0, 1, 2), allow_int=True))
 
 def after_tasks(number):
     """Columns trained by a few gradient steps, and what each task began with."""
-    params, memory = METHOD.init(KEY)
+    params, state = METHOD.init(KEY)
     columns, starts = [], []
     for task in range(number):
         key = jax.random.fold_in(KEY, task)
-        params, memory = METHOD.start_task(key, params, memory, task)
-        starts.append((params, memory))
+        params, state = METHOD.start_task(key, params, state, task)
+        starts.append((params, state))
         for _ in range(3):
-            slope, *_ = slopes(params, memory, OBSERVATION)
+            slope, *_ = slopes(params, state, OBSERVATION)
             params = jax.tree.map(lambda x, g: x - 0.01 * g, params, slope)
         columns.append(params)
-        params, memory = METHOD.end_task(params, memory, task, None)
-    return params, memory, columns, starts
+        params, state = METHOD.end_task(params, state, task, None)
+    return params, state, columns, starts
 
 
 @pytest.fixture(scope="module")
@@ -102,9 +102,9 @@ def learned():
 
 @pytest.mark.parametrize("task", range(TASKS))
 def test_a_column_plays_as_with_unpadded_concatenations(learned, task):
-    params, memory, columns, starts = learned
+    params, state, columns, starts = learned
     expected = played(columns[: task + 1])
-    near(METHOD.act(METHOD.policy(params, memory, task), OBSERVATION), expected)
+    near(METHOD.act(METHOD.policy(params, state, task), OBSERVATION), expected)
     # In training, too.
     column, then = starts[task]
     expected = played([*columns[:task], column])
@@ -121,8 +121,8 @@ def test_the_earlier_columns_matter(learned):
 
 def test_only_the_new_column_learns(learned):
     _, _, _, starts = learned
-    for task, (params, memory) in enumerate(starts):
-        own, frozen, observation = slopes(params, memory, OBSERVATION)
+    for task, (params, state) in enumerate(starts):
+        own, frozen, observation = slopes(params, state, OBSERVATION)
         assert all(not leaf.any() for leaf in arrays(frozen.columns))
         assert not np.any(observation)
         for layer in own.layers:
@@ -140,8 +140,8 @@ def test_only_the_new_column_learns(learned):
 
 
 def test_the_gradient_is_that_of_finite_differences(learned):
-    params, memory = learned[3][2]
-    slope, *_ = slopes(params, memory, OBSERVATION)
+    params, state = learned[3][2]
+    slope, *_ = slopes(params, state, OBSERVATION)
     rng = np.random.default_rng(0)
     direction = jax.tree.map(lambda x: rng.normal(size=x.shape), params)
 
@@ -162,10 +162,10 @@ def test_the_gradient_is_that_of_finite_differences(learned):
 def test_a_learned_task_never_changes():
     outputs = []
     for number in range(1, TASKS + 1):
-        params, memory, *_ = after_tasks(number)
-        states = [(params, memory)]
+        params, state, *_ = after_tasks(number)
+        states = [(params, state)]
         if number < TASKS:
-            states.append(METHOD.start_task(KEY, params, memory, number))
+            states.append(METHOD.start_task(KEY, params, state, number))
         for state in states:
             now = [
                 METHOD.act(METHOD.policy(*state, task), OBSERVATION)
@@ -181,21 +181,21 @@ def test_a_learned_task_never_changes():
 
 
 def test_before_training_all_tasks_have_the_first_column():
-    params, memory = METHOD.init(KEY)
+    params, state = METHOD.init(KEY)
     for task in range(TASKS):
-        output = METHOD.act(METHOD.policy(params, memory, task), OBSERVATION)
+        output = METHOD.act(METHOD.policy(params, state, task), OBSERVATION)
         near(output, played([params]))
 
 
 def test_a_sequence_of_one_task_is_a_plain_policy():
     method = pnn.pnn(SPEC._replace(tasks=1), OPTIONS)
-    params, memory = method.init(KEY)
-    params, memory = method.start_task(KEY, params, memory, 0)
+    params, state = method.init(KEY)
+    params, state = method.start_task(KEY, params, state, 0)
     expected = networks.mlp_policy(params.layers, OBSERVATION)
-    near(method.distribution(params, memory, (), OBSERVATION), expected)
-    params, memory = method.end_task(params, memory, 0, None)
-    near(method.act(method.policy(params, memory, 0), OBSERVATION), expected)
-    assert method.size(params, memory) == 3 * 4 + 4 + 4 * 4 + 4 + 4 * 4 + 4
+    near(method.distribution(params, state, (), OBSERVATION), expected)
+    params, state = method.end_task(params, state, 0, None)
+    near(method.act(method.policy(params, state, 0), OBSERVATION), expected)
+    assert method.size(params, state) == 3 * 4 + 4 + 4 * 4 + 4 + 4 * 4 + 4
 
 
 def test_columns_start_uniform_within_their_fan_in():
@@ -229,7 +229,7 @@ def test_eight_columns_have_the_published_size(observations, actions, base, publ
     spec = Spec(observations, actions, hidden=256, depth=3, tasks=8)
     options = pnn.preset("halfcheetah/forgetting", 4, "paper")
     method = pnn.pnn(spec, options)
-    params, memory = jax.eval_shape(method.init, KEY)
+    params, state = jax.eval_shape(method.init, KEY)
     for learned in range(9):
         numbers = 0
         for place in range(max(learned, 1)):
@@ -243,20 +243,20 @@ def test_eight_columns_have_the_published_size(observations, actions, base, publ
                 numbers += inputs * outputs + outputs
                 if place > 0 and inputs == n:
                     numbers += 1 + place * n * n + n * outputs + outputs
-        assert method.size(params, memory._replace(learned=learned)) == numbers
+        assert method.size(params, state._replace(learned=learned)) == numbers
     assert round(numbers / base, 1) == published
 
 
 def test_members_are_the_same_alone():
     def member(key):
-        first, memory = PLAIN.init(key)
-        params, memory = PLAIN.end_task(first, memory, 0, None)
-        params, memory = PLAIN.start_task(key, params, memory, 1)
-        slope = jax.grad(loss)(params, memory)
+        first, state = PLAIN.init(key)
+        params, state = PLAIN.end_task(first, state, 0, None)
+        params, state = PLAIN.start_task(key, params, state, 1)
+        slope = jax.grad(loss)(params, state)
         params = jax.tree.map(lambda x, g: x - 0.01 * g, params, slope)
-        params, memory = PLAIN.end_task(params, memory, 1, None)
+        params, state = PLAIN.end_task(params, state, 1, None)
         tasks = jnp.arange(TASKS)
-        policies = jax.vmap(PLAIN.policy, (None, None, 0))(params, memory, tasks)
+        policies = jax.vmap(PLAIN.policy, (None, None, 0))(params, state, tasks)
         return jax.vmap(PLAIN.act, (0, None))(policies, OBSERVATION)
 
     keys = jax.random.split(KEY, 2)
@@ -276,9 +276,9 @@ def test_presets_and_settings():
 def test_policies_of_all_tasks_hold_the_columns_once():
     def bytes_of(tasks):
         plan = prepare(replace(tiny(method="pnn"), seeds=3, tasks=tasks))
-        learner = jax.eval_shape(plan.program.init, plan.members)
-        policies = jax.eval_shape(plan.program.policies, plan.members, learner)
-        return size(policies), size(learner.memory.columns)
+        learner = jax.eval_shape(plan.program.init, plan.stacked)
+        policies = jax.eval_shape(plan.program.policies, plan.stacked, learner)
+        return size(policies), size(learner.state.columns)
 
     for tasks in (1, 2, 3):
         policies, columns = bytes_of(tasks)
@@ -287,22 +287,22 @@ def test_policies_of_all_tasks_hold_the_columns_once():
 
 def test_policies_that_share_play_as_each_alone():
     plan = prepare(tiny(method="pnn"))
-    program, members, tasks = plan.program, plan.members, plan.tasks
+    program, members, tasks = plan.program, plan.stacked, plan.tasks
     learner = program.init(members)
     for stage in range(plan.spec.tasks):
-        params, memory = jax.vmap(
-            lambda key, params, memory, t=stage: pnn_of(plan).start_task(
-                key, params, memory, t
+        params, state = jax.vmap(
+            lambda key, params, state, t=stage: pnn_of(plan).start_task(
+                key, params, state, t
             )
-        )(members.keys, learner.params, learner.memory)
-        learner = learner._replace(params=params, memory=memory)
+        )(members.keys, learner.params, learner.state)
+        learner = learner._replace(params=params, state=state)
         learner = program.finish(members, learner, stage, None)
     keys = jax.vmap(lambda key: jax.random.split(key, len(plan.names)))(members.keys)
     together = program.rollout(
         tasks, program.policies(members, learner), keys, 2
     ).returns
-    for place, row in itertools.product(range(plan.places), range(len(plan.names))):
-        mine = jax.tree.map(lambda x, p=place: x[p], (learner.params, learner.memory))
+    for place, row in itertools.product(range(plan.num_slots), range(len(plan.names))):
+        mine = jax.tree.map(lambda x, p=place: x[p], (learner.params, learner.state))
         policy = pnn_of(plan).policy(*mine, jnp.asarray(row))
         stacked = jax.tree.map(lambda x: x[None], policy)
         stacked = map_own(lambda x: x[None], stacked)
@@ -315,7 +315,7 @@ def test_policies_that_share_play_as_each_alone():
             2,
         )
         np.testing.assert_allclose(alone.returns[0, 0], together[place, row], rtol=1e-4)
-    assert len(set(np.asarray(together).ravel().tolist())) > plan.places
+    assert len(set(np.asarray(together).ravel().tolist())) > plan.num_slots
 
 
 def pnn_of(plan):

@@ -49,28 +49,28 @@ def changed(rng, params):
     )
 
 
-def end(method, params, memory, task, observation):
+def end(method, params, state, task, observation):
     if method.consolidate is not None:
-        params, memory = method.consolidate(
-            KEY, params, memory, task, buffer(observation)
+        params, state = method.consolidate(
+            KEY, params, state, task, buffer(observation)
         )
-    return method.end_task(params, memory, task, None)
+    return method.end_task(params, state, task, None)
 
 
 def run(method, tasks, seed=0):
-    """Parameters, memory and each task's trained policy after some tasks."""
+    """Parameters, state and each task's trained policy after some tasks."""
     rng, own = np.random.default_rng(seed), []
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     for task in range(tasks):
-        params, memory = method.start_task(KEY, params, memory, task)
+        params, state = method.start_task(KEY, params, state, task)
         params = changed(rng, params)
         own.append(params)
-        params, memory = end(method, params, memory, task, states(task))
-    return params, memory, own
+        params, state = end(method, params, state, task, states(task))
+    return params, state, own
 
 
-def penalty(method, params, memory):
-    loss, metrics = method.penalty(KEY, params, memory, (), states(9), None)
+def penalty(method, params, state):
+    loss, metrics = method.penalty(KEY, params, state, (), states(9), None)
     assert metrics.keys() == {"distance"}
     return loss
 
@@ -188,21 +188,21 @@ def test_fisher_is_the_mean_square_of_the_score(layers):
 
 def test_ewc_adds_up_the_tasks():
     method = METHODS["ewc"]
-    _, memory, own = run(method, 2)
+    _, state, own = run(method, 2)
     first, second = (brute_force(own[task], states(task)) for task in range(2))
-    assert_near(memory.importance, jax.tree.map(np.add, first, second), rtol=2e-5)
+    assert_near(state.importance, jax.tree.map(np.add, first, second), rtol=2e-5)
 
 
 def test_ewc_draws_its_states_with_its_key():
     method, drawn = METHODS["ewc"], []
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
 
     def sample(key, count):
         drawn.append((key, count))
         return buffer(states(0)).sample(key, count)
 
     tools = buffer(states(0))._replace(sample=sample)
-    method.consolidate(jax.random.key(5), params, memory, 0, tools)
+    method.consolidate(jax.random.key(5), params, state, 0, tools)
     ((key, count),) = drawn
     assert key == jax.random.key(5)
     assert count == STATES
@@ -214,10 +214,10 @@ def test_ewc_draws_its_states_with_its_key():
 @both
 def test_no_penalty_before_a_task_has_ended(name):
     method = METHODS[name]
-    params, memory = method.init(KEY)
-    params, memory = method.start_task(KEY, params, memory, 0)
+    params, state = method.init(KEY)
+    params, state = method.start_task(KEY, params, state, 0)
     params = changed(np.random.default_rng(3), params)
-    loss, gradient = jax.value_and_grad(lambda p: penalty(method, p, memory))(params)
+    loss, gradient = jax.value_and_grad(lambda p: penalty(method, p, state))(params)
     assert loss == 0
     assert_same(gradient, jax.tree.map(np.zeros_like, params))
 
@@ -225,13 +225,13 @@ def test_no_penalty_before_a_task_has_ended(name):
 @both
 def test_penalty_is_the_weighted_square_of_the_distance(name):
     method, rng = METHODS[name], np.random.default_rng(4)
-    params, memory, own = run(method, 2)
-    assert penalty(method, params, memory) == 0
+    params, state, own = run(method, 2)
+    assert penalty(method, params, state) == 0
     ones = jax.tree.map(np.ones_like, params)
-    weight = memory.importance if name == "ewc" else ones
+    weight = state.importance if name == "ewc" else ones
     moved = changed(rng, params)
     gap = jax.tree.map(lambda a, b: np.asarray(a, np.float64) - b, moved, own[-1])
-    loss, gradient = jax.value_and_grad(lambda p: penalty(method, p, memory))(moved)
+    loss, gradient = jax.value_and_grad(lambda p: penalty(method, p, state))(moved)
     terms = jax.tree.map(lambda f, g: np.sum(f * g**2), weight, gap)
     np.testing.assert_allclose(loss, C * sum(jax.tree.leaves(terms)), rtol=1e-5)
     assert_near(gradient, jax.tree.map(lambda f, g: 2 * C * f * g, weight, gap))
@@ -240,35 +240,35 @@ def test_penalty_is_the_weighted_square_of_the_distance(name):
 @both
 def test_one_policy_for_all_tasks(name):
     method = METHODS[name]
-    params, memory, own = run(method, 2)
+    params, state, own = run(method, 2)
     for task in range(SPEC.tasks):
-        assert_same(method.policy(params, memory, task), own[-1])
-    started, _ = method.start_task(KEY, params, memory, 2)
+        assert_same(method.policy(params, state, task), own[-1])
+    started, _ = method.start_task(KEY, params, state, 2)
     assert_same(started, own[-1])
 
 
 @pytest.mark.parametrize(("name", "copies"), [("ft_l2", 2), ("ewc", 3)])
 def test_size_counts_what_the_penalty_needs(name, copies):
     for tasks in range(3):
-        params, memory, _ = run(METHODS[name], tasks)
-        assert METHODS[name].size(params, memory) == copies * NUMBERS
+        params, state, _ = run(METHODS[name], tasks)
+        assert METHODS[name].size(params, state) == copies * NUMBERS
 
 
 @both
 def test_members_side_by_side_are_as_alone_and_traced_once(name):
     traces = []
 
-    def task_of_member(coefficient, params, memory, task, moves, observation):
+    def task_of_member(coefficient, params, state, task, moves, observation):
         traces.append(task)
         if name == "ft_l2":
             method = regularization.ft_l2(SPEC, FtL2Settings(coefficient=coefficient))
         else:
             options = EwcSettings(coefficient=coefficient, fisher_states=STATES)
             method = regularization.ewc(SPEC, options)
-        params, memory = method.start_task(KEY, params, memory, task)
+        params, state = method.start_task(KEY, params, state, task)
         params = jax.tree.map(jnp.add, params, moves)
-        loss, slope = jax.value_and_grad(lambda p: penalty(method, p, memory))(params)
-        return *end(method, params, memory, task, observation), loss, slope
+        loss, slope = jax.value_and_grad(lambda p: penalty(method, p, state))(params)
+        return *end(method, params, state, task, observation), loss, slope
 
     method, rng = METHODS[name], np.random.default_rng(6)
     coefficients = jnp.asarray([0.5, 20.0])

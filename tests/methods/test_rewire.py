@@ -50,10 +50,10 @@ def divergence(hidden, scores, head, observation=OBSERVATION):
 def test_mode_divergence_against_a_loop_over_pairs(learned):
     rng = np.random.default_rng(29)
     method = make(dropout=0.3)  # must not be seen in it
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     params = trained(rng, params)
-    memory = memory._replace(learned=jnp.asarray(learned))
-    told = method.inspect(params, memory, OBSERVATION)
+    state = state._replace(learned=jnp.asarray(learned))
+    told = method.inspect(params, state, OBSERVATION)
     head = head_at(params, learned)
     expected = divergence(params.hidden, params.scores, head)
     assert expected > 0.1
@@ -64,14 +64,14 @@ def test_mode_divergence_against_a_loop_over_pairs(learned):
 
 
 def test_modes_that_are_not_in_use_have_no_part_in_the_divergence():
-    params, memory = make().init(KEY)
+    params, state = make().init(KEY)
     params = trained(np.random.default_rng(31), params)
     told = {}
     for modes in (1, 2, 3):
         method = make(modes=modes, mode_slots=5)
         spare = np.full((2, *params.scores.shape[1:]), np.nan, np.float32)
         wide = params._replace(scores=np.concatenate([params.scores, spare]))
-        told[modes] = method.inspect(wide, memory, OBSERVATION)["mode_divergence"]
+        told[modes] = method.inspect(wide, state, OBSERVATION)["mode_divergence"]
         if modes > 1:
             expected = divergence(
                 params.hidden, params.scores[:modes], head_at(params, 0)
@@ -83,11 +83,11 @@ def test_modes_that_are_not_in_use_have_no_part_in_the_divergence():
 
 def test_equal_modes_are_not_apart():
     method = make()
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     params = trained(np.random.default_rng(37), params)
     # The same order in other scores: the policy is the same.
     scores = np.stack([params.scores[0] * factor for factor in (1.0, 2.0, 0.5)])
-    told = method.inspect(params._replace(scores=scores), memory, OBSERVATION)
+    told = method.inspect(params._replace(scores=scores), state, OBSERVATION)
     assert told["mode_divergence"] == 0
 
 
@@ -96,17 +96,17 @@ def test_equal_modes_are_not_apart():
 
 def test_alignment_off_is_a_distance_of_weights_and_moves_no_wiring():
     method, rng = make(alignment="off", alpha=0.0, beta=2.0), np.random.default_rng(20)
-    params, memory = after_tasks(method, 2, rng)
-    began, memory = method.start_task(KEY, params, memory, 2)
+    params, state = after_tasks(method, 2, rng)
+    began, state = method.start_task(KEY, params, state, 2)
     moved = trained(rng, began)._replace(adapters=began.adapters)
 
     def loss(params):
         context = Context(0, 0, QUIET, KEY)
-        gaussian = method.distribution(params, memory, context, OBSERVATION)
-        return method.penalty(KEY, params, memory, context, OBSERVATION, gaussian)[0]
+        gaussian = method.distribution(params, state, context, OBSERVATION)
+        return method.penalty(KEY, params, state, context, OBSERVATION, gaussian)[0]
 
     value, gradient = jax.value_and_grad(loss)(moved)
-    gaps = jax.tree.map(np.subtract, moved.hidden, memory.previous)
+    gaps = jax.tree.map(np.subtract, moved.hidden, state.previous)
     squares = sum(np.sum(gap.astype(np.float64) ** 2) for gap in jax.tree.leaves(gaps))
     np.testing.assert_allclose(value, 2 * squares, rtol=1e-5)
     assert_near(
@@ -114,23 +114,23 @@ def test_alignment_off_is_a_distance_of_weights_and_moves_no_wiring():
     )
     for leaf in jax.tree.leaves((gradient.adapters, gradient.scores)):
         np.testing.assert_array_equal(leaf, 0)
-    _, kept = method.end_task(moved, memory, 2, None)
-    np.testing.assert_array_equal(kept.orders[:2], memory.orders[:2])
-    stored = make().size(params, memory) - method.size(params, memory)
+    _, kept = method.end_task(moved, state, 2, None)
+    np.testing.assert_array_equal(kept.orders[:2], state.orders[:2])
+    stored = make().size(params, state) - method.size(params, state)
     assert stored == (2 * DEPTH - 1) * N
 
 
 def test_without_caching_all_tasks_share_the_latest_wiring():
     method, rng = make(caching=False), np.random.default_rng(21)
-    params, memory = after_tasks(method, 3, rng)
-    assert memory.orders.shape == (1, DEPTH, N)
-    assert np.any(memory.orders[0] != np.arange(N))
+    params, state = after_tasks(method, 3, rng)
+    assert state.orders.shape == (1, DEPTH, N)
+    assert np.any(state.orders[0] != np.arange(N))
     for task in range(3):
-        played = method.act(method.policy(params, memory, task), OBSERVATION)
+        played = method.act(method.policy(params, state, task), OBSERVATION)
         head = head_at(params, task)
-        assert_near(played, play(params.hidden, memory.orders[0], head))
-    began, _ = method.start_task(KEY, params, memory, 3)
-    np.testing.assert_array_equal(orders_of(began.scores[0]), memory.orders[0])
+        assert_near(played, play(params.hidden, state.orders[0], head))
+    began, _ = method.start_task(KEY, params, state, 3)
+    np.testing.assert_array_equal(orders_of(began.scores[0]), state.orders[0])
     cached = make()
     spared = cached.size(*cached.init(KEY)) - method.size(*method.init(KEY))
     assert spared == (SLOTS - 1) * DEPTH * N
@@ -138,12 +138,12 @@ def test_without_caching_all_tasks_share_the_latest_wiring():
 
 def test_the_policy_may_have_a_width_of_its_own():
     method = make(width=9)
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     assert params.scores.shape == (K, DEPTH, 9)
     same = make(SPEC._replace(hidden=9))
-    assert method.size(params, memory) == same.size(params, memory)
+    assert method.size(params, state) == same.size(params, state)
     context = Context(0, 0, QUIET[:, :9], KEY)
-    mean, _ = method.distribution(params, memory, context, OBSERVATION)
+    mean, _ = method.distribution(params, state, context, OBSERVATION)
     assert mean.shape == (7, ACTIONS)
 
 
@@ -171,14 +171,14 @@ def test_model_size(row):
     assert by_hand == stored
     spec = Spec(observations, actions, 256, 3, 8)
     baseline = finetune.ft1(spec, finetune.FinetuneSettings())
-    params, memory = jax.eval_shape(baseline.init, KEY)
-    assert baseline.size(params, memory) == hidden + head
+    params, state = jax.eval_shape(baseline.init, KEY)
+    assert baseline.size(params, state) == hidden + head
 
     for places in (0, 5):  # spare places are not stored
         options = RewireSettings(head_slots=heads, mode_slots=places).checked()
         method = rewiring.rewire(spec, options)
-        params, memory = jax.eval_shape(method.init, KEY)
-        assert method.size(params, memory) == stored
+        params, state = jax.eval_shape(method.init, KEY)
+        assert method.size(params, state) == stored
     if published:
         assert stored / (hidden + head) == pytest.approx(published, rel=0.01)
 

@@ -36,14 +36,14 @@ from tests.rewired import (
 
 def test_distribution_is_the_wired_network_of_the_mode():
     method, rng = make(), np.random.default_rng(1)
-    params, memory = after_tasks(method, 2, rng)
-    params, memory = method.start_task(KEY, params, memory, 2)
+    params, state = after_tasks(method, 2, rng)
+    params, state = method.start_task(KEY, params, state, 2)
     params = trained(rng, params)
     noise = rng.normal(size=(DEPTH, N)).astype(np.float32)
     for mode in range(K):
         for added in (QUIET, noise):
             got = method.distribution(
-                params, memory, Context(mode, 0, added, KEY), OBSERVATION
+                params, state, Context(mode, 0, added, KEY), OBSERVATION
             )
             orders = orders_of(params.scores[mode] + added)
             assert_near(got, play(params.hidden, orders, head_at(params, 2)))
@@ -51,17 +51,17 @@ def test_distribution_is_the_wired_network_of_the_mode():
 
 def test_distribution_takes_any_batch():
     method = make()
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     context = Context(0, 0, QUIET, KEY)
-    whole = method.distribution(params, memory, context, OBSERVATION)
-    one = method.distribution(params, memory, context, OBSERVATION[0])
+    whole = method.distribution(params, state, context, OBSERVATION)
+    one = method.distribution(params, state, context, OBSERVATION[0])
     assert_near(one, (whole[0][0], whole[1][0]))
 
 
 @pytest.mark.parametrize("rate", ["step", "gradient"])
 def test_only_the_mode_in_use_learns_in_all_layers(rate):
     # By the dense straight-through form, with the gradient times K if asked.
-    params, memory = make().init(KEY)
+    params, state = make().init(KEY)
     params = jax.tree.map(jnp.asarray, trained(np.random.default_rng(2), params))
 
     def ours(scores, tau):
@@ -69,7 +69,7 @@ def test_only_the_mode_in_use_learns_in_all_layers(rate):
         method = rewiring.rewire(SPEC, dataclasses.replace(options, mode_slots=K))
         context = Context(1, 0, QUIET, KEY)
         mean, log_std = method.distribution(
-            params._replace(scores=scores), memory, context, OBSERVATION
+            params._replace(scores=scores), state, context, OBSERVATION
         )
         return jnp.sum(jnp.sin(mean) + log_std**2)
 
@@ -97,14 +97,14 @@ def test_only_the_mode_in_use_learns_in_all_layers(rate):
 
 
 def test_gradient_scaling_leaves_close_scores_in_order():
-    params, memory = make().init(KEY)
+    params, state = make().init(KEY)
     close = np.float32(0.3) + np.float32(2**-24) * np.arange(N, dtype=np.float32)
     scores = np.random.default_rng(3).permuted(np.tile(close, (K, DEPTH, 1)), axis=-1)
     params = params._replace(scores=scores)
     context = Context(2, 0, QUIET, KEY)
     assert_same(
         *(
-            make(mode_rate=rate).distribution(params, memory, context, OBSERVATION)
+            make(mode_rate=rate).distribution(params, state, context, OBSERVATION)
             for rate in ("step", "gradient")
         )
     )
@@ -112,11 +112,11 @@ def test_gradient_scaling_leaves_close_scores_in_order():
 
 @pytest.mark.parametrize(("rate", "factor"), [("step", K), ("gradient", 1)])
 def test_updates_are_scaled_after_the_optimiser(rate, factor):
-    params, memory = make().init(KEY)
+    params, state = make().init(KEY)
     updates = jax.tree.map(jnp.ones_like, params)
-    got = make(mode_rate=rate).adjust_updates(updates, memory)
+    got = make(mode_rate=rate).adjust_updates(updates, state)
     assert_same(got, updates._replace(scores=factor * updates.scores))
-    got = make(mode_rate=rate, adapter_rate=0.5).adjust_updates(updates, memory)
+    got = make(mode_rate=rate, adapter_rate=0.5).adjust_updates(updates, state)
     expected = updates._replace(
         adapters=jax.tree.map(lambda u: 0.5 * u, updates.adapters),
         scores=factor * updates.scores,
@@ -130,8 +130,8 @@ def test_updates_are_scaled_after_the_optimiser(rate, factor):
 @functools.partial(jax.jit, static_argnames=("number", "purpose"))
 def contexts(options, number, purpose):
     method = rewiring.rewire(SPEC, options)
-    _, memory = method.init(KEY)
-    draw = jax.vmap(lambda key: method.context(key, memory, purpose, ()))
+    _, state = method.init(KEY)
+    draw = jax.vmap(lambda key: method.context(key, state, purpose, ()))
     return draw(jax.random.split(KEY, number))
 
 
@@ -171,12 +171,12 @@ def test_dropout_has_its_rate_and_keeps_the_mean():
     # One layer, where LeakyReLU passes the factor of a kept neuron through.
     rate, number = 0.25, 4000
     method = make(FLAT, dropout=rate)
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     context = Context(0, 0, np.zeros((1, N), np.float32), jax.random.split(KEY, number))
     draw = jax.vmap(
         method.distribution, (None, None, Context(None, None, None, 0), None)
     )
-    means = np.asarray(draw(params, memory, context, OBSERVATION)[0], np.float64)
+    means = np.asarray(draw(params, state, context, OBSERVATION)[0], np.float64)
     (weight, bias), head = params.hidden[0], head_at(params, 0)
     x = OBSERVATION @ weight.T + bias
     terms = np.where(x > 0, x, 0.2 * x)[:, :, None] * head.weight.T[None, :, :ACTIONS]
@@ -188,7 +188,7 @@ def test_dropout_has_its_rate_and_keeps_the_mean():
     # Every state of a batch has its own mask.
     same = np.broadcast_to(OBSERVATION[:1], (50, OBSERVATIONS))
     one = Context(0, 0, np.zeros((1, N), np.float32), KEY)
-    assert np.unique(method.distribution(params, memory, one, same)[0]).size > 50
+    assert np.unique(method.distribution(params, state, one, same)[0]).size > 50
 
 
 # Distillation
@@ -223,23 +223,23 @@ def test_squares_in_numbers():
 
 
 @jax.jit
-def penalty_and_gradient(options, params, memory, mode, noise):
+def penalty_and_gradient(options, params, state, mode, noise):
     method = rewiring.rewire(SPEC, options)
 
     def loss(params, other):
         context = Context(mode, other, noise, KEY)
-        gaussian = method.distribution(params, memory, context, OBSERVATION)
-        return method.penalty(KEY, params, memory, context, OBSERVATION, gaussian)
+        gaussian = method.distribution(params, state, context, OBSERVATION)
+        return method.penalty(KEY, params, state, context, OBSERVATION, gaussian)
 
     both = jax.value_and_grad(loss, has_aux=True)
     return jax.vmap(both, (None, 0))(params, jnp.arange(K))
 
 
-def penalties(options, params, memory, mode, noise=QUIET):
+def penalties(options, params, state, mode, noise=QUIET):
     """Penalty, metrics and gradient with each mode as the other one."""
     options = RewireSettings(**{"modes": K, "head_slots": SLOTS} | options).checked()
     (value, metrics), gradient = penalty_and_gradient(
-        options, params, memory, mode, noise
+        options, params, state, mode, noise
     )
     return value, metrics, gradient
 
@@ -254,10 +254,10 @@ FORMS = {
 @pytest.mark.parametrize("form", FORMS)
 def test_distillation_draws_the_mode_to_the_others(form):
     options = {"alpha": 1e-3} | FORMS[form]
-    params, memory = make().init(KEY)
+    params, state = make().init(KEY)
     params = trained(np.random.default_rng(5), params)
     mode, others = 1, (0, 2)
-    value, metrics, gradient = penalties(options, params, memory, mode)
+    value, metrics, gradient = penalties(options, params, state, mode)
     head = head_at(params, 0)
     policies = [play(params.hidden, orders_of(v), head) for v in params.scores]
 
@@ -313,15 +313,15 @@ def test_distillation_draws_the_mode_to_the_others(form):
 
 def test_nothing_to_distil():
     # Identical modes, and a single mode whose own noise makes it differ.
-    params, memory = make().init(KEY)
-    value = penalties({"alpha": 1.0}, params, memory, 0)[0]
+    params, state = make().init(KEY)
+    value = penalties({"alpha": 1.0}, params, state, 0)[0]
     assert np.all(np.abs(value) < 1e-3)
 
     noise = np.random.default_rng(20).normal(size=QUIET.shape).astype(np.float32)
-    value = penalties({"alpha": 1.0}, params, memory, 0, noise)[0]
+    value = penalties({"alpha": 1.0}, params, state, 0, noise)[0]
     assert np.all(value > 0.1)
     options = {"modes": 1, "mode_slots": K, "alpha": 1.0}
-    value, metrics, gradient = penalties(options, params, memory, 0, noise)
+    value, metrics, gradient = penalties(options, params, state, 0, noise)
     np.testing.assert_array_equal(value, 0)
     np.testing.assert_array_equal(metrics["distillation"], 0)
     for leaf in jax.tree.leaves(gradient):
@@ -335,17 +335,17 @@ def test_nothing_to_distil():
 def test_alignment_counts_from_the_second_task_on(form):
     options = {"alpha": 0.0, "beta": 2.0, "adapter_tau": 0.3} | FORMS[form]
     method, rng = make(), np.random.default_rng(6)
-    params, memory = method.init(KEY)
+    params, state = method.init(KEY)
     changed = trained(rng, params)
     inspect = make(**options).inspect
-    value, _, gradient = penalties(options, changed, memory, 0)
+    value, _, gradient = penalties(options, changed, state, 0)
     np.testing.assert_array_equal(value, 0)
-    assert inspect(changed, memory, OBSERVATION)["alignment"] == 0
+    assert inspect(changed, state, OBSERVATION)["alignment"] == 0
     for leaf in jax.tree.leaves(gradient):
         np.testing.assert_array_equal(leaf, 0)
 
-    params, memory = after_tasks(method, 1, rng)
-    params, memory = method.start_task(KEY, params, memory, 1)
+    params, state = after_tasks(method, 1, rng)
+    params, state = method.start_task(KEY, params, state, 1)
     changed = trained(rng, params)
 
     def expected(hidden, adapters):
@@ -353,11 +353,11 @@ def test_alignment_counts_from_the_second_task_on(form):
             hidden, params.hidden, adapters, 0.3, expanded=form == "squares"
         )
 
-    value, _, gradient = penalties(options, changed, memory, 0)
+    value, _, gradient = penalties(options, changed, state, 0)
     loss, wanted = jax.jit(jax.value_and_grad(expected, (0, 1)))(
         changed.hidden, changed.adapters
     )
-    told = inspect(changed, memory, OBSERVATION)["alignment"]
+    told = inspect(changed, state, OBSERVATION)["alignment"]
     np.testing.assert_allclose(told, loss, rtol=1e-5)
     np.testing.assert_allclose(value, 2 * loss, rtol=1e-5)
     for a, b in zip(

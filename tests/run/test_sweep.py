@@ -176,12 +176,12 @@ def kept(folder: Path) -> list[np.ndarray]:
     variants = [
         sweep_grid.configure(small(), values) for values in sweep_grid.grid(GRID)
     ]
-    settings, crowd = sweep._crowd(small(), sweep_grid.grid(GRID))
-    assert len(crowd) == len(variants)
+    settings, members = sweep._members(small(), sweep_grid.grid(GRID))
+    assert len(members) == len(variants)
     leaves = []
     for number, batch in enumerate(first["batches"]):
-        members = [crowd[n] for n in batch]
-        prepared = run_setup.prepare(settings, crowd=members, places=first["size"])
+        members = [members[n] for n in batch]
+        prepared = run_setup.prepare(settings, members=members, num_slots=first["size"])
         path = folder / f"task-001/batch-{number:03d}"
         leaves += jax.tree.leaves(run_state.read_kept(path, 1, prepared))
     return leaves
@@ -218,19 +218,19 @@ from rewire_jax.run import sweep, sweep_grid
 from rewire_jax.training import run_setup
 from tests.run.test_sweep import GRID, small
 
-settings, crowd = sweep._crowd(small(), sweep_grid.grid(GRID))
-made = run_setup.prepare(settings, crowd=crowd)
-learner = made.program.init(made.members)
+settings, members = sweep._members(small(), sweep_grid.grid(GRID))
+made = run_setup.prepare(settings, members=members)
+learner = made.program.init(made.stacked)
 task = jax.tree.map(lambda leaf: leaf[0], made.tasks)
-alive = jnp.ones(24, bool)
-state = made.program.begin(made.members, learner, alive, 0, task)
-chunk = made.program.chunk.lower(made.members, state, 0, task, 0, 20)
+active = jnp.ones(24, bool)
+state = made.program.begin(made.stacked, learner, active, 0, task)
+chunk = made.program.chunk.lower(made.stacked, state, 0, task, 0, 20)
 whole = jax.shard_map(
     lambda x: jax.lax.psum(x, "members"), mesh=made.mesh, in_specs=P("members"),
     out_specs=P(),
 )
 print(json.dumps({
-    "devices": [str(s.data.shape[0]) for s in state.alive.addressable_shards],
+    "devices": [str(s.data.shape[0]) for s in state.active.addressable_shards],
     "chunk": chunk.compile().as_text(),
     "control": jax.jit(whole).lower(jnp.ones(24)).compile().as_text(),
 }))
@@ -283,13 +283,13 @@ def run_sweep(folder: Path, settings: Settings, **options) -> Path:
 
 
 def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
-    # Seven members in places for eight.
+    # Seven members in slots for eight.
     sac = dataclasses.replace(small().sac, hidden=15)
     settings = dataclasses.replace(small(), sac=sac)
     axis = {"beta": [1, 2, 3, 4, 5, 6, 7]}
     folder = run_sweep(tmp_path / "s", settings, axes=axis, members_per_batch=4)
-    shared, crowd = sweep._crowd(settings, sweep_grid.grid(axis))
-    program = run_setup.prepare(shared, crowd=crowd[:4])[-1]
+    shared, members = sweep._members(settings, sweep_grid.grid(axis))
+    program = run_setup.prepare(shared, members=members[:4])[-1]
     traces = {
         name: function._cache_size()
         for name, function in program._asdict().items()

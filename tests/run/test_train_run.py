@@ -53,7 +53,7 @@ def checkpoints(folder: Path) -> list[str]:
 
 def leaves(folder: Path, settings: Settings) -> list[np.ndarray]:
     prepared = run_setup.prepare(settings)
-    learner = jax.eval_shape(prepared.program.init, prepared.members)
+    learner = jax.eval_shape(prepared.program.init, prepared.stacked)
     like = {"policy": (learner.params, learner.memory), "critic": learner.critic}
     items, _ = checkpoint.load(run_state.kept(folder, None), like)
     return jax.tree.leaves(items)

@@ -27,17 +27,17 @@ def test_every_scenario_trains_through_all_its_tasks_in_one_program(domain) -> N
             settings, seeds=2, interactions=8, envs=2, updates=2, warmup=4, sac=sac
         )
         prepared = run_setup.prepare(settings, scenario)
-        program, members = prepared.program, prepared.members
+        program, members = prepared.program, prepared.stacked
         programs.add(program)
-        learner, alive = program.init(members), jnp.ones(2, bool)
+        learner, active = program.init(members), jnp.ones(2, bool)
         first = []
         assert len(prepared.names) == TASKS[domain]
         for index, task in enumerate(scenario.tasks):
-            state = program.begin(members, learner, alive, index, task.data)
+            state = program.begin(members, learner, active, index, task.data)
             first.append(np.asarray(state.collection.episodes.state.observation))
             state, report = program.chunk(members, state, index, task.data, 0, 4)
             before, learner = learner, state.learner
-            assert bool(jnp.all(state.alive))
+            assert bool(jnp.all(state.active))
             assert np.all(np.asarray(report.updates) == 2)
             moved = jax.tree.map(
                 lambda a, b: float(jnp.max(jnp.abs(a - b))),

@@ -76,15 +76,15 @@ def plan():
 @pytest.fixture(scope="module")
 def state(plan):
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-    learner = jax.eval_shape(plan.program.init, plan.members)
-    alive = jax.ShapeDtypeStruct((plan.places,), bool)
-    return plan.program.state_shape(plan.members, learner, alive, 0, task)
+    learner = jax.eval_shape(plan.program.init, plan.stacked)
+    active = jax.ShapeDtypeStruct((plan.num_slots,), bool)
+    return plan.program.state_shape(plan.stacked, learner, active, 0, task)
 
 
 @pytest.fixture(scope="module")
 def lowered(plan, state):
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-    return plan.program.chunk.lower(plan.members, state, 0, task, 0, 10)
+    return plan.program.chunk.lower(plan.stacked, state, 0, task, 0, 10)
 
 
 @pytest.fixture(scope="module")

@@ -59,9 +59,9 @@ def planned(environment=None, method="ft1", **changes) -> Plan:
 
 
 def begin(plan: Plan, index=0):
-    alive = np.ones(plan.places, bool)
-    learner = plan.program.init(plan.members)
-    return plan.program.begin(plan.members, learner, alive, index, walk.TASKS[index])
+    active = np.ones(plan.num_slots, bool)
+    learner = plan.program.init(plan.stacked)
+    return plan.program.begin(plan.stacked, learner, active, index, walk.TASKS[index])
 
 
 def go(plan: Plan, state, chunks, time=0, index=0):
@@ -70,7 +70,7 @@ def go(plan: Plan, state, chunks, time=0, index=0):
     reports = []
     for steps in chunks:
         state, report = plan.program.chunk(
-            plan.members, state, index, walk.TASKS[index], time, steps
+            plan.stacked, state, index, walk.TASKS[index], time, steps
         )
         time += steps
         reports.append(jax.tree.map(np.asarray, report))
@@ -103,15 +103,15 @@ def test_the_loop_does_what_the_compiled_one_does(method, color):
     (ours, ours_reports), (theirs, theirs_reports) = results
     close(ours.learner, theirs.learner)
     close(ours.collection.buffer, theirs.collection.buffer)
-    close(ours.collection.label, theirs.collection.label)
+    close(ours.collection.extras, theirs.collection.extras)
     close(ours_reports, theirs_reports)
     assert ours_reports[1].updates == 8
     assert ours_reports[1].episodes >= 2
     assert abs(ours.collection.buffer.reward).sum() > 1
     for plan, (state, _) in zip(plans, results, strict=True):
         expected = plan.program.state_shape(
-            plan.members,
-            jax.eval_shape(plan.program.init, plan.members),
+            plan.stacked,
+            jax.eval_shape(plan.program.init, plan.stacked),
             np.ones(1, bool),
             0,
             walk.TASKS[0],
@@ -155,7 +155,7 @@ def test_chunks_do_not_matter_nor_what_was_played_between(overlap):
     first, reports = go(plan, start, [20])
     # Eight steps into an episode; now something else is played, then other simulators.
     assert first.collection.episodes.steps == 8
-    policies = plan.program.policies(plan.members, first.learner)
+    policies = plan.program.policies(plan.stacked, first.learner)
     keys = jax.random.split(jax.random.key(3), (1, 2))
     plan.program.rollout(plan.tasks, policies, keys, 2)
     second, more = go(plan, first, [20], time=20)
@@ -241,7 +241,7 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
         state, _ = go(plan, states[-1], [EVERY], time=EVERY * number)
         states.append(state)
     final = states[-1].collection.buffer
-    member = jax.tree.map(lambda x: x[0], plan.members)
+    member = jax.tree.map(lambda x: x[0], plan.stacked)
     key = jax.random.split(jax.random.fold_in(jax.random.fold_in(member.keys, 1), 0), 4)
     method = find_method("ft1").make(plan.spec, plan.settings.options)
 
@@ -312,9 +312,9 @@ def test_with_overlap_steps_and_updates_are_made_at_the_same_time(monkeypatch):
 def test_rollouts_are_those_of_a_loop():
     environment = walk.walker(0.9)
     plan = planned(environment, seeds=2, seed=4)
-    learner = plan.program.init(plan.members)
+    learner = plan.program.init(plan.stacked)
     # Policies that reach the goals, and run over the edge on the way to some.
-    policies = plan.program.policies(plan.members, learner)
+    policies = plan.program.policies(plan.stacked, learner)
     policies = jax.tree.map(lambda x: 4 * x, policies)
     keys = jax.random.split(jax.random.key(5), (2, 2))
     count = 5  # for two lanes: the last wave has one to spare

@@ -32,10 +32,10 @@ def needed(method: str = "rewire", **changes) -> memory_estimate.Need:
 
 def planned(plan: Plan) -> tuple[float, float]:
     """Bytes a member that XLA plans for, in training and in an evaluation."""
-    program, members = plan.program, plan.members
+    program, members = plan.program, plan.stacked
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     learner = program.init(members)
-    state = program.begin(members, learner, jnp.ones(plan.places, bool), 0, task)
+    state = program.begin(members, learner, jnp.ones(plan.num_slots, bool), 0, task)
     policies = program.policies(members, learner)
     keys = jax.vmap(lambda key: jax.random.split(key, len(plan.names)))(members.keys)
 
@@ -46,7 +46,7 @@ def planned(plan: Plan) -> tuple[float, float]:
     def taken(lowered):
         analysis = lowered.compile().memory_analysis()
         both = analysis.argument_size_in_bytes + analysis.temp_size_in_bytes
-        return both / plan.places
+        return both / plan.num_slots
 
     return (
         taken(program.chunk.lower(members, state, 0, task, 0, 2)),

@@ -70,9 +70,9 @@ def crowd(method="ft1"):
 
 
 def begin(program, members, index=0):
-    alive = np.ones(len(members.keys), bool)
+    active = np.ones(len(members.keys), bool)
     learner = program.init(members)
-    return program.begin(members, learner, alive, index, TASKS[index])
+    return program.begin(members, learner, active, index, TASKS[index])
 
 
 def go(program, members, state, chunks, time=0, index=0):
@@ -153,7 +153,7 @@ def same_alone(method, program, state, reports, steps):
         jax.tree.map(near, member(reports[-1], number), member(lonely_reports[-1], 0))
         policy = member(program.policies(alone, lonely.learner), 0)
         jax.tree.map(near, together[number], policy)
-        assert lonely.alive.all()
+        assert lonely.active.all()
 
 
 def test_members_are_the_same_alone(program, whole):
@@ -218,17 +218,17 @@ def test_a_member_that_is_not_finite_is_frozen(program, started, whole, place):
         buffer = collection.buffer._replace(reward=reward)
         planted = halfway._replace(collection=collection._replace(buffer=buffer))
     state, _ = go(program, members, planted, [15], time=10)
-    np.testing.assert_array_equal(state.alive, [True, False, True, True])
+    np.testing.assert_array_equal(state.active, [True, False, True, True])
     # What it had last stays, with the optimisers.
     equal(member(state.learner, 1), member(planted.learner, 1))
     for number in (0, 2, 3):
         equal(member(state, number), member(whole[0], number))
     # It stays frozen in the next task.
-    alive = np.array(state.alive)
-    state = program.begin(members, state.learner, alive, 1, TASKS[1])
+    active = np.array(state.active)
+    state = program.begin(members, state.learner, active, 1, TASKS[1])
     frozen = member(state.learner, 1)
     state, _ = go(program, members, state, [WARMUP + 1], index=1)
-    np.testing.assert_array_equal(state.alive, alive)
+    np.testing.assert_array_equal(state.active, active)
     equal(member(state.learner, 1), frozen)
 
 
@@ -278,8 +278,8 @@ def test_exploring_actions_have_the_noise_of_the_setting(program, started, pink)
     *hidden, last = started.learner.params
     params = (*hidden, jax.tree.map(jnp.zeros_like, last))
     learner = started.learner._replace(params=params)
-    alive = jnp.zeros_like(started.alive)
-    state = started._replace(learner=learner, alive=alive)
+    active = jnp.zeros_like(started.active)
+    state = started._replace(learner=learner, active=active)
     seen = []
     for time in range(0, 220, 20):
         state, _ = go(program, pink, state, [20], time=time)
@@ -332,15 +332,15 @@ def sequence(method, tasks):
         for name, function in program._asdict().items()
         if hasattr(function, "_cache_size") and name != "offline_update"
     }
-    learner, alive = program.init(members), np.ones(4, bool)
+    learner, active = program.init(members), np.ones(4, bool)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *TASKS)
     keys = jax.random.split(jax.random.key(0), (4, len(TASKS)))
     returns = []
     for index in range(tasks):
-        state = program.begin(members, learner, alive, index, TASKS[index])
+        state = program.begin(members, learner, active, index, TASKS[index])
         for time, steps in ((0, 6), (6, 3), (9, 1)):
             state, _ = program.chunk(members, state, index, TASKS[index], time, steps)
-        learner, alive = state.learner, np.array(state.alive)
+        learner, active = state.learner, np.array(state.active)
         selection = None
         if program.candidates is not None:
             valid = program.candidates(members, learner, index).valid
