@@ -42,7 +42,7 @@ class Adapter(Gymnax):
         """Steps; gymnax's own would compute a reset in each step."""
         episode, step = rollout.advance(self.environment, self.task, state, action)
         done = step.terminal | step.truncated
-        return step.following, episode, step.reward, done, {}
+        return step.next_obs, episode, step.reward, done, {}
 
     def action_space(self, params: Any = None) -> spaces.Box:
         """From -1 to 1."""

@@ -47,7 +47,7 @@ class Adapter(VecEnv):
         done = step.terminal | step.truncated
         infos: list[dict[str, Any]] = [{} for _ in done]
         for number in np.flatnonzero(done):
-            infos[number]["terminal_observation"] = step.last[number]
+            infos[number]["terminal_observation"] = step.final_obs[number]
         return self.vector.observation, step.reward, done, infos
 
     def close(self) -> None:

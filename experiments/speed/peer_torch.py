@@ -287,7 +287,7 @@ def whole_loop(settings: Settings, environment: Environment, task: Task) -> Loop
             action = sample(learner.policy(torch.tensor(before)))[0].numpy()
         step = vector.step(action)
         ended = step.terminal | step.truncated
-        buffer.add(tensors(before, action, step.reward, ended, step.last))
+        buffer.add(tensors(before, action, step.reward, ended, step.final_obs))
 
     def loop(count):
         for _ in range(count):

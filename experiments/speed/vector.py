@@ -37,5 +37,5 @@ class Vector:
         """Steps all; the arrays are NumPy's, `[count, ...]`."""
         self._episodes, step = self._advance(self._episodes, action)
         step = jax.tree.map(np.asarray, step)
-        self.observation = np.asarray(step.following)
+        self.observation = np.asarray(step.next_obs)
         return step

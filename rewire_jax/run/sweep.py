@@ -121,7 +121,7 @@ class Sweep:
     def share(self, members: int) -> tuple[int, int]:
         """Places in a batch and how many batches, for so many members."""
         devices = jax.local_device_count()
-        # In whole rounds of the devices, as num_slots are.
+        # In whole rounds of the devices, as slots are.
         most = max(self.most - self.most % devices, min(self.most, devices))
         count = math.ceil(members / most)
         if members >= jax.process_count():

@@ -186,7 +186,7 @@ def batch(folder: Path, stage: int, number: int) -> Path:
 
 
 def read_batches(path: Path) -> tuple[list[list[int]], int]:
-    """The members of each batch, and the num_slots in it; from `batches_of`.
+    """The members of each batch, and its number of slots; from `batches_of`.
 
     Raises:
       UserError: the file is missing or damaged.

@@ -77,7 +77,7 @@ def advance(
     shape = episodes.steps.shape
     scaled = action * np.asarray(task.action_scale)
     moment = lanes.step(scaled.reshape(-1, action.shape[-1]))
-    last = following = shown(moment.observation, task, shape)
+    final_obs = next_obs = shown(moment.observation, task, shape)
     reward, terminal = moment.reward.reshape(shape), moment.terminal.reshape(shape)
     known = environment.success
     solved = moment.success.reshape(shape) if known else ()
@@ -89,11 +89,11 @@ def advance(
     if ended.any():
         number = number + ended.astype(np.int32)
         begun = seeds(roots, number).ravel()
-        following = shown(lanes.reset(lanes.task, begun, ended.ravel()), task, shape)
+        next_obs = shown(lanes.reset(lanes.task, begun, ended.ravel()), task, shape)
         after = jax.tree.map(lambda x: np.where(ended, np.zeros_like(x), x), after)
-    return Episode(
-        State(number, following, reward, terminal, solved), (), *after
-    ), Step(reward, terminal, truncated, last, following, score, success)
+    return Episode(State(number, next_obs, reward, terminal, solved), (), *after), Step(
+        reward, terminal, truncated, final_obs, next_obs, score, success
+    )
 
 
 def replay_actions(

@@ -79,8 +79,8 @@ def add(
     reward: jax.Array,
     terminal: jax.Array,
     truncated: jax.Array,
-    last: jax.Array,
-    following: jax.Array,
+    final_obs: jax.Array,
+    next_obs: jax.Array,
     episode_length: int,
     extras: Any = (),
 ) -> Replay:
@@ -93,8 +93,8 @@ def add(
       reward: `[envs]`.
       terminal: `[envs]` bool.
       truncated: `[envs]` bool.
-      last: `[envs, observations]`, what the step led to.
-      following: `[envs, observations]`, the same but for ended episodes, where it
+      final_obs: `[envs, observations]`, what the step led to.
+      next_obs: `[envs, observations]`, the same but for ended episodes, where it
         is the first observation of the next one.
       episode_length: as in `create`.
       extras: as in `create`.
@@ -107,12 +107,12 @@ def add(
     row, cut = time % rows, (time // episode_length) % cuts
     kept = jax.lax.dynamic_index_in_dim(replay.final, cut, 0, keepdims=False)
     return Replay(
-        observation=put(replay.observation, (time + 1) % rows, following),
+        observation=put(replay.observation, (time + 1) % rows, next_obs),
         action=put(replay.action, row, action),
         reward=put(replay.reward, row, reward),
         terminal=put(replay.terminal, row, terminal),
         truncated=put(replay.truncated, row, truncated),
-        final=put(replay.final, cut, jnp.where(truncated[:, None], last, kept)),
+        final=put(replay.final, cut, jnp.where(truncated[:, None], final_obs, kept)),
         extras=jax.tree.map(lambda a, v: put(a, row, v), replay.extras, extras),
     )
 

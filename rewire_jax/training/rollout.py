@@ -53,8 +53,8 @@ class Step(NamedTuple):
       reward: `[]`.
       terminal: `[]` bool, ended by the task.
       truncated: `[]` bool, ended by the time limit alone.
-      last: `[observations]`, what the step led to.
-      following: `[observations]`, the same or a fresh start's.
+      final_obs: `[observations]`, what the step led to.
+      next_obs: `[observations]`, the same or a fresh start's.
       score: `[]`, return of the episode so far.
       success: `Success` of `[]` bool in it; `()` where none is known.
     """
@@ -62,8 +62,8 @@ class Step(NamedTuple):
     reward: jax.Array
     terminal: jax.Array
     truncated: jax.Array
-    last: jax.Array
-    following: jax.Array
+    final_obs: jax.Array
+    next_obs: jax.Array
     score: jax.Array
     success: Any = ()
 
@@ -130,8 +130,8 @@ def advance(
         reward=state.reward,
         terminal=state.terminal,
         truncated=truncated,
-        last=state.observation,
-        following=after.observation,
+        final_obs=state.observation,
+        next_obs=after.observation,
         score=score,
         success=success,
     )

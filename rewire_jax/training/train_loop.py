@@ -162,8 +162,8 @@ def store(
         reward=step.reward,
         terminal=step.terminal,
         truncated=step.truncated,
-        last=step.last,
-        following=step.following,
+        final_obs=step.final_obs,
+        next_obs=step.next_obs,
         episode_length=episode_length,
         extras=extras,
     )

@@ -64,8 +64,8 @@ class Ledger:
             reward=reward,
             terminal=terminal,
             truncated=truncated,
-            last=last,
-            following=following,
+            final_obs=last,
+            next_obs=following,
         )
         self.steps[ended] = 0
         self.observation = following
@@ -156,8 +156,8 @@ def test_members_have_buffers_of_their_own():
             reward=jnp.full(ENVS, value),
             terminal=jnp.zeros(ENVS, bool),
             truncated=jnp.ones(ENVS, bool),
-            last=jnp.full((ENVS, 2), 10 + value),
-            following=jnp.full((ENVS, 2), 20 + value),
+            final_obs=jnp.full((ENVS, 2), 10 + value),
+            next_obs=jnp.full((ENVS, 2), 20 + value),
             episode_length=2,
         )
         return buffer, replay_buffer.sample(buffer, jax.random.key(0), 1, 8, 2)

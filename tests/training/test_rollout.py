@@ -73,9 +73,9 @@ def test_an_ended_episode_returns_to_its_own_start(own_end, length):
             assert seen.score == pytest.approx(score)
             assert bool(seen.terminal) == (count == own_end)
             assert bool(seen.truncated) == (ended and own_end > LENGTH)
-            np.testing.assert_array_equal(seen.last, [start, count])
+            np.testing.assert_array_equal(seen.final_obs, [start, count])
             following = [start, 0 if ended else count]
-            np.testing.assert_array_equal(seen.following, following)
+            np.testing.assert_array_equal(seen.next_obs, following)
             assert int(episode.steps) == (0 if ended else count)
             assert episode.score == pytest.approx(0 if ended else score)
         jax.tree.map(np.testing.assert_array_equal, episode, begun)
