@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.methods.base import Method, MethodState, Params
 from rewire_jax.nn import networks
-from rewire_jax.training import colored_noise
+from rewire_jax.training import colored_noise, random_keys
+from rewire_jax.training.random_keys import CollectKeys
 
 
 class ActionNoise(NamedTuple):
@@ -45,16 +46,16 @@ def sample_noise(
       random: steps in the task whose actions are uniform.
       sequence: the coloured noise that `time` lies in, None where noise is white.
     """
-    context_key, action_key, random_key, extras_key = jax.random.split(key, 4)
+    keys = random_keys.named(CollectKeys, key)
     if sequence is None:
-        noise = jax.random.normal(action_key, size)
+        noise = jax.random.normal(keys.action, size)
     else:
         noise = sequence[time % len(sequence)]
     return ActionNoise(
-        context=jax.random.key_data(context_key),
-        extras=jax.random.key_data(extras_key),
+        context=jax.random.key_data(keys.context),
+        extras=jax.random.key_data(keys.extras),
         noise=noise,
-        uniform=jax.random.uniform(random_key, size, minval=-1.0),
+        uniform=jax.random.uniform(keys.uniform, size, minval=-1.0),
         blind=time < random,
     )
 
@@ -105,7 +106,5 @@ def sample_colored(
       length: of an episode.
       settings: SAC's.
     """
-    # A key that the steps do not use.
-    start_key = jax.random.fold_in(key, time - time % length)
-    sequence_key = jax.random.split(start_key, 4)[3]
-    return colored_noise.colored(sequence_key, settings.noise_color, length, size)
+    noise_key = random_keys.of_step(key, time - time % length).noise
+    return colored_noise.colored(noise_key, settings.noise_color, length, size)

@@ -20,9 +20,15 @@ from numpy.typing import NDArray
 
 from rewire_jax.envs.base import HostEnvironment, Task
 from rewire_jax.envs.vector_env import open_lanes, shown
-from rewire_jax.methods.base import Method
-from rewire_jax.training import exploration, host_episodes, population, train_loop
+from rewire_jax.training import (
+    exploration,
+    host_episodes,
+    population,
+    random_keys,
+    train_loop,
+)
 from rewire_jax.training.host_rollout import play
+from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Members
 from rewire_jax.training.rollout import Rollout, Step
 from rewire_jax.training.train_loop import ChunkMetrics, CollectorState, LoopConfig
@@ -46,7 +52,7 @@ class _Functions(NamedTuple):
     Attributes:
       roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
       begin: `(members, learner, active, index, episodes) -> State`.
-      draws: `(members, index, time) -> exploring.Draw` `[members, every]`, of the
+      draws: `(members, index, time) -> ActionNoise` `[members, every]`, of the
         next steps: drawn for each alone, they would take half of an action's time.
       act: `(members, draws, number, acting, extras, observation, steps) -> actions,
         extras`, by the draw with that number; on the CPU, where it waits for no other
@@ -66,27 +72,17 @@ class _Functions(NamedTuple):
     inspect: Callable[..., dict[str, jax.Array]]
 
 
-def loop(
-    environment: HostEnvironment,
-    make: Callable[[Any], Method],
-    act: Callable[..., Any],
-    task_keys: Callable[[Any, Any], jax.Array],
-    begin: Callable[..., train_loop.RunnerState],
-    shape: LoopConfig,
-    mesh: Mesh,
-) -> Loop:
+def loop(of: MemberFunctions, act: Callable[..., Any], mesh: Mesh) -> Loop:
     """The loop's functions.
 
     Args:
-      environment: stepped on the host.
-      make: `member -> Method`.
+      of: functions of one member; its environment is stepped on the host.
       act: `Method.act`.
-      task_keys: `(member, index) -> keys`, those of a task's start and steps first.
-      begin: `(member, learner, active, index, episodes) -> State`, a task's start.
-      shape: sizes of the loop.
       mesh: the devices.
     """
-    functions = _compile(environment, make, task_keys, begin, shape, mesh)
+    environment, shape = of.environment, of.shape
+    assert isinstance(environment, HostEnvironment)
+    functions = _compile(of, mesh)
     counted: list[Any] = [functions.act, functions.store_and_update]
 
     def first(members, index, task):
@@ -122,21 +118,15 @@ def loop(
     )
 
 
-def _compile(
-    environment: HostEnvironment,
-    make: Callable[[Any], Method],
-    task_keys: Callable[[Any, Any], jax.Array],
-    begin: Callable[..., train_loop.RunnerState],
-    shape: LoopConfig,
-    mesh: Mesh,
-) -> _Functions:
+def _compile(of: MemberFunctions, mesh: Mesh) -> _Functions:
+    environment, shape = of.environment, of.shape
     length, size = environment.episode_length, (shape.envs, environment.action_size)
 
     def roots(member, index):
-        return jax.random.key_data(jax.random.split(task_keys(member, index)[0], 4)[1])
+        return jax.random.key_data(of.start_keys(member, index).reset)
 
     def draws(member, index, time):
-        key, sac = task_keys(member, index)[1], member.sac
+        key, sac = of.keys(member, index).steps, member.sac
         sequences = None
         if sac.noise_color:
             # All that a turn may touch, each drawn once.
@@ -145,21 +135,21 @@ def _compile(
                 lambda start: exploration.sample_colored(key, start, size, length, sac)
             )(starts)
 
-        def of(now):
+        def of_step(now):
             sequence = None
             if sequences is not None:
                 sequence = sequences[now // length - time // length]
-            collect_key, _ = jax.random.split(jax.random.fold_in(key, now))
+            collect_key = random_keys.of_step(key, now).collect
             return exploration.sample_noise(
                 collect_key, now, size, shape.random, sequence
             )
 
-        return jax.vmap(of)(time + jnp.arange(shape.every))
+        return jax.vmap(of_step)(time + jnp.arange(shape.every))
 
     def act(members, draws, number, acting, extras, observation, steps):
         def one(member, draws, acting, extras, observation, steps):
             draw = jax.tree.map(lambda leaf: leaf[number], draws)
-            method = make(member)
+            method = of.method(member)
             return exploration.explore(draw, acting, extras, observation, steps, method)
 
         return jax.vmap(one)(members, draws, acting, extras, observation, steps)
@@ -172,16 +162,16 @@ def _compile(
 
         buffer = jax.lax.fori_loop(0, shape.every, store, buffer)
         done = time + shape.every
-        key = jax.random.fold_in(task_keys(member, index)[1], done - 1)
+        step_keys = random_keys.of_step(of.keys(member, index).steps, done - 1)
         state, metrics = train_loop.update_from_buffer(
-            jax.random.split(key)[1],
+            step_keys.update,
             train_loop.RunnerState(learner, CollectorState(buffer, (), ()), active),
             done,
             shape.before(done),
             shape.due(done),
             updates=shape.updates,
             environment=environment,
-            method=make(member),
+            method=of.method(member),
             settings=member.sac,
         )
         return state.learner, buffer, state.active, metrics
@@ -190,14 +180,14 @@ def _compile(
         state = train_loop.RunnerState(
             learner, CollectorState(buffer, (), ()), jnp.asarray(True)
         )
-        key, method = task_keys(member, index)[1], make(member)
+        key, method = of.keys(member, index).steps, of.method(member)
         return train_loop.inspect(key, state, time, length, method, member.sac)
 
     over = functools.partial(population.over, mesh)
 
     return _Functions(
         roots=over(roots, 0, None),
-        begin=over(begin, 0, 0, 0, None, 0),
+        begin=over(of.start, 0, 0, 0, None, 0),
         draws=over(draws, 0, None, None),
         # Called at each step, and so not through `shard_map`, which takes its time.
         act=jax.jit(act),

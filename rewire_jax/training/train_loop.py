@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Method
-from rewire_jax.training import exploration, replay_buffer, rollout, sac
+from rewire_jax.training import exploration, random_keys, replay_buffer, rollout, sac
+from rewire_jax.training.random_keys import CollectKeys
 
 
 class LoopConfig(NamedTuple):
@@ -133,7 +134,8 @@ def collect(
     length = environment.episode_length
     if environment.varied:
         # All episodes end together, and so are reset in a real branch.
-        keys = jax.random.split(jax.random.split(key, 5)[4], shape.envs)
+        reset_key = random_keys.named(CollectKeys, key).reset
+        keys = jax.random.split(reset_key, shape.envs)
         starts = jax.lax.cond(
             (time + 1) % length == 0,
             lambda: jax.vmap(lambda k: environment.reset(task, k))(keys),
@@ -284,12 +286,12 @@ def train(
                 lambda: exploration.sample_colored(key, index, size, length, settings),
                 lambda: sequence,
             )
-        collect_key, update_key = jax.random.split(jax.random.fold_in(key, index))
+        keys = random_keys.of_step(key, index)
         collection, stepped = collect(
-            collect_key, state, task, index, environment, method, shape, sequence
+            keys.collect, state, task, index, environment, method, shape, sequence
         )
         state = state._replace(collection=collection)
-        state, metrics = update(update_key, state, index + 1)
+        state, metrics = update(keys.update, state, index + 1)
         ended = stepped.terminal | stepped.truncated
         report = ChunkMetrics(
             report.episodes + jnp.sum(ended),
@@ -335,8 +337,7 @@ def inspect(
     settings: SacSettings,
 ) -> sac.Metrics:
     """The method's own metrics after `time` steps; key and length as above."""
-    # A key that the next step does not use.
-    batch_key = jax.random.split(jax.random.fold_in(key, time), 3)[2]
+    batch_key = random_keys.of_step(key, time).inspect
     buffer, learner = state.collection.buffer, state.learner
     batch = replay_buffer.sample(buffer, batch_key, time, settings.batch_size, length)
     return method.inspect(learner.params, learner.method_state, batch.observation)

@@ -1,0 +1,209 @@
+"""What a run does with one member, as pure functions to be vmapped and compiled."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.envs.base import Environment, HostEnvironment, Task
+from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools, axes
+from rewire_jax.training import random_keys, replay_buffer, rollout, sac, train_loop
+from rewire_jax.training.population import Members
+from rewire_jax.training.random_keys import StartKeys, TaskKeys
+from rewire_jax.training.sac import TrainState
+from rewire_jax.training.train_loop import CollectorState, LoopConfig, RunnerState
+
+
+@dataclass(frozen=True)
+class MemberFunctions:
+    """Functions of one member; all that they hold is static.
+
+    `member` is an entry of `Members`, `index` the `[]` int of a task in the sequence,
+    `time` the steps of all environments made in it.
+
+    Attributes:
+      environment: of the scenario.
+      make: the method's constructor.
+      spec: sizes of the networks and of the sequence.
+      shape: sizes of the loop.
+    """
+
+    environment: Environment | HostEnvironment
+    make: Callable[[Spec, Any], Method]
+    spec: Spec
+    shape: LoopConfig
+
+    def method(self, member: Members) -> Method:
+        """The member's method."""
+        return self.make(self.spec, member.options)
+
+    def keys(self, member: Members, index: jax.Array) -> TaskKeys:
+        """The member's keys for a task."""
+        return random_keys.of_task(member.keys, index)
+
+    def start_keys(self, member: Members, index: jax.Array) -> StartKeys:
+        """The same for the task's start."""
+        return random_keys.named(StartKeys, self.keys(member, index).start)
+
+    def init(self, member: Members) -> TrainState:
+        """What is learned, before the first task."""
+        key = jax.random.fold_in(member.keys, 0)
+        return sac.init(key, self.method(member), self.spec, member.sac)
+
+    def begin(
+        self,
+        member: Members,
+        learner: TrainState,
+        active: jax.Array,
+        index: jax.Array,
+        task: Task,
+    ) -> RunnerState:
+        """A task's start, with compiled environments."""
+        keys = jax.random.split(self.start_keys(member, index).reset, self.shape.envs)
+        environment = self.environment
+        assert isinstance(environment, Environment)
+        episodes = jax.vmap(lambda key: rollout.begin(environment, task, key))(keys)
+        return self.start(member, learner, active, index, episodes)
+
+    def start(
+        self,
+        member: Members,
+        learner: TrainState,
+        active: jax.Array,
+        index: jax.Array,
+        episodes: rollout.Episode,
+    ) -> RunnerState:
+        """A task's start, given its environments `[envs]`."""
+        method, keys = self.method(member), self.start_keys(member, index)
+        params, method_state = method.start_task(
+            keys.method, learner.params, learner.method_state, index
+        )
+        learner = learner._replace(params=params, method_state=method_state)
+        if method.fresh_critic:
+            critic = sac.init_critic(keys.critic, self.spec, method.critic_extra)
+            learner = learner._replace(critic=critic)
+        extras = method.extras(keys.extras, method_state, None, episodes.steps)
+        buffer = replay_buffer.create(
+            episodes.state.observation,
+            transitions=self.shape.transitions,
+            actions=self.spec.actions,
+            episode_length=self.environment.episode_length,
+            extras=extras,
+        )
+        learner = sac.restart(learner, member.sac)
+        acting = (params, method_state) if self.shape.overlap else ()
+        collection = CollectorState(buffer, episodes, extras)
+        return RunnerState(learner, collection, active, acting)
+
+    def chunk(
+        self,
+        member: Members,
+        state: RunnerState,
+        index: jax.Array,
+        task: Task,
+        time: jax.Array,
+        steps: jax.Array,
+    ) -> tuple[RunnerState, train_loop.ChunkMetrics]:
+        """Collects and learns for some steps of compiled environments."""
+        assert isinstance(self.environment, Environment)
+        return train_loop.train(
+            self.keys(member, index).steps,
+            state,
+            task,
+            time,
+            steps,
+            environment=self.environment,
+            method=self.method(member),
+            settings=member.sac,
+            shape=self.shape,
+        )
+
+    def consolidate(
+        self, member: Members, state: RunnerState, index: jax.Array, time: jax.Array
+    ) -> TrainState:
+        """The end of a task's interactions, for methods that have one."""
+        method = self.method(member)
+        assert method.consolidate is not None
+        learner, buffer = state.learner, state.collection.buffer
+
+        def sample(key, count):
+            length = self.environment.episode_length
+            return replay_buffer.sample(buffer, key, time, count, length)
+
+        def q(context, observation, action):
+            inputs = method.critic_input(context, observation)
+            return sac.q_values(learner.critic, inputs, action)
+
+        params, method_state = method.consolidate(
+            self.keys(member, index).consolidate,
+            learner.params,
+            learner.method_state,
+            index,
+            Tools(sample, q),
+        )
+        learner = learner._replace(params=params, method_state=method_state)
+        return sac.restart(learner, member.sac)
+
+    def offline_update(
+        self,
+        member: Members,
+        state: RunnerState,
+        index: jax.Array,
+        time: jax.Array,
+        done: jax.Array,
+        steps: jax.Array,
+    ) -> RunnerState:
+        """Updates from the buffer as in `steps` steps, `done` of which were before."""
+        method = self.method(member)
+        update = functools.partial(
+            train_loop.update_from_buffer,
+            due=True,
+            updates=self.shape.updates,
+            environment=self.environment,
+            method=method,
+            settings=method.offline_sac(member.sac),
+        )
+        key = self.keys(member, index).offline
+
+        def step(number, state):
+            first = number * self.shape.updates
+            step_key = jax.random.fold_in(key, number)
+            return update(step_key, state, time, first)[0]
+
+        return jax.lax.fori_loop(done, done + steps, step, state)
+
+    def candidates(
+        self, member: Members, learner: TrainState, index: jax.Array
+    ) -> Candidates:
+        """The policies among which the method chooses, if it does."""
+        method = self.method(member)
+        assert method.candidates is not None
+        return method.candidates(learner.params, learner.method_state, index)
+
+    def finish(
+        self,
+        member: Members,
+        learner: TrainState,
+        index: jax.Array,
+        selection: Selection | None,
+    ) -> TrainState:
+        """The end of a task."""
+        params, method_state = self.method(member).end_task(
+            learner.params, learner.method_state, index, selection
+        )
+        return learner._replace(params=params, method_state=method_state)
+
+    def policies(self, member: Members, learner: TrainState) -> Any:
+        """The policies of all tasks, `[tasks]` but for what they share."""
+        of_task = self.method(member).policy
+        policy = functools.partial(of_task, learner.params, learner.method_state)
+        tasks = jnp.arange(self.spec.tasks)
+        out_axes = axes(jax.eval_shape(policy, tasks[0]))
+        return jax.vmap(policy, out_axes=out_axes)(tasks)
+
+    def size(self, member: Members, learner: TrainState) -> jax.Array:
+        """`[]`, the numbers that the method stores."""
+        return self.method(member).size(learner.params, learner.method_state)

@@ -1,0 +1,98 @@
+"""What each random key is for: a key is split into named ones, never by index.
+
+Keys of a member come from its seed, those of a task from the member's and the task's
+index, those of a step from the task's and the number of the step. So what is drawn
+does not depend on chunks, on checkpoints, or on other members.
+"""
+
+from typing import NamedTuple, TypeVar
+
+import jax
+
+Keys = TypeVar("Keys", bound="NamedTuple")
+
+
+class TaskKeys(NamedTuple):
+    """A task's keys.
+
+    Attributes:
+      start: see `StartKeys`.
+      steps: of its steps, each of which folds in its number.
+      consolidate: of the method, when the task's interactions are over.
+      offline: of the updates after that.
+    """
+
+    start: jax.Array
+    steps: jax.Array
+    consolidate: jax.Array
+    offline: jax.Array
+
+
+class StartKeys(NamedTuple):
+    """Keys of a task's start.
+
+    Attributes:
+      method: of the method.
+      reset: of the environments.
+      critic: of fresh critics.
+      extras: of the first extras.
+    """
+
+    method: jax.Array
+    reset: jax.Array
+    critic: jax.Array
+    extras: jax.Array
+
+
+class StepKeys(NamedTuple):
+    """Keys of a step of all environments of a member.
+
+    Attributes:
+      collect: see `CollectKeys`.
+      update: of the updates after it.
+      inspect: of the batch that a progress report looks at.
+      noise: of the coloured noise of the episode that begins here.
+    """
+
+    collect: jax.Array
+    update: jax.Array
+    inspect: jax.Array
+    noise: jax.Array
+
+
+class CollectKeys(NamedTuple):
+    """Keys of a step's actions.
+
+    Attributes:
+      context: of the method's context.
+      action: of the policy's noise.
+      uniform: of actions that take no heed of the policy.
+      extras: of the method's extras.
+      reset: of environments that begin an episode.
+    """
+
+    context: jax.Array
+    action: jax.Array
+    uniform: jax.Array
+    extras: jax.Array
+    reset: jax.Array
+
+
+def named(kind: type[Keys], key: jax.Array) -> Keys:
+    """The keys of a kind that one key is split into."""
+    return kind(*jax.random.split(key, len(kind._fields)))
+
+
+def of_task(key: jax.Array, index: jax.Array) -> TaskKeys:
+    """The keys of a member's task.
+
+    A key is either split or folded, never both: `split(key)[i]` is the same as
+    `fold_in(key, i)`.
+    """
+    key = jax.random.fold_in(jax.random.fold_in(key, 1), index)
+    return named(TaskKeys, key)
+
+
+def of_step(key: jax.Array, time: jax.Array) -> StepKeys:
+    """A step's keys, from `TaskKeys.steps` and the steps made before in the task."""
+    return named(StepKeys, jax.random.fold_in(key, time))
