@@ -41,8 +41,10 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
     def begin(member):
         method = make(spec, member.options)
         learner = sac.init(member.keys, method, spec, member.sac)
-        kept = method.end_task(learner.params, learner.method_state, 0, None)
-        params, method_state = method.start_task(member.keys, *kept, 1)
+        kept = method.end_task(
+            learner.params, learner.method_state, jnp.asarray(0), None
+        )
+        params, method_state = method.start_task(member.keys, *kept, jnp.asarray(1))
         learner = learner._replace(params=params, method_state=method_state)
         return member, sac.restart(learner, member.sac)
 

@@ -1,7 +1,7 @@
 """What a continual-learning method is: a record of pure functions."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +108,164 @@ class Selection(NamedTuple):
     after: jax.Array
 
 
+class Init(Protocol):
+    """Parameters and state before the first task."""
+
+    def __call__(self, key: jax.Array, /) -> tuple[Params, MethodState]: ...
+
+
+class Distribution(Protocol):
+    """Mean and log-std of the Gaussian before the squashing, `[..., actions]` each.
+
+    It is given `[..., observations]`.
+    """
+
+    def __call__(
+        self,
+        params: Params,
+        state: MethodState,
+        context: Context,
+        observation: jax.Array,
+        /,
+    ) -> tuple[jax.Array, jax.Array]: ...
+
+
+class PolicyOf(Protocol):
+    """The policy for a task, after any number of finished tasks.
+
+    A task not yet seen gets the latest policy, or the one that the method knows to
+    belong to it.
+    """
+
+    def __call__(
+        self, params: Params, state: MethodState, task: jax.Array, /
+    ) -> Policy: ...
+
+
+class Act(Protocol):
+    """What `Distribution` gives, from a policy; the same object for all members."""
+
+    def __call__(
+        self, policy: Policy, observation: jax.Array, /
+    ) -> tuple[jax.Array, jax.Array]: ...
+
+
+class Size(Protocol):
+    """`[]`, how many numbers are stored for all policies."""
+
+    def __call__(self, params: Params, state: MethodState, /) -> jax.Array: ...
+
+
+class StartTask(Protocol):
+    """Parameters and state at a task's start.
+
+    Optimisers and temperature start anew by themselves.
+    """
+
+    def __call__(
+        self, key: jax.Array, params: Params, state: MethodState, task: jax.Array, /
+    ) -> tuple[Params, MethodState]: ...
+
+
+class ExtrasOf(Protocol):
+    """Extras `[envs, ...]` that are stored with the transitions of a step.
+
+    `steps` `[envs]` counts those of the running episodes. `extras` are those of the
+    step before, None in a task's first.
+    """
+
+    def __call__(
+        self, key: jax.Array, state: MethodState, extras: Extras, steps: jax.Array, /
+    ) -> Extras: ...
+
+
+class ContextOf(Protocol):
+    """What is drawn for an update or an acting step.
+
+    `extras` `[batch, ...]` are those of its transitions.
+    """
+
+    def __call__(
+        self, key: jax.Array, state: MethodState, purpose: Purpose, extras: Extras, /
+    ) -> Context: ...
+
+
+class Penalty(Protocol):
+    """A loss `[]`, added to SAC's policy loss, and metrics of it by name.
+
+    `gaussian` is what `Distribution` gave for the same arguments.
+    """
+
+    def __call__(
+        self,
+        key: jax.Array,
+        params: Params,
+        state: MethodState,
+        context: Context,
+        observation: jax.Array,
+        gaussian: tuple[jax.Array, jax.Array],
+        /,
+    ) -> tuple[jax.Array, dict[str, jax.Array]]: ...
+
+
+class Inspect(Protocol):
+    """Metrics `[]` by name, from a batch of observations, once a progress report."""
+
+    def __call__(
+        self, params: Params, state: MethodState, observation: jax.Array, /
+    ) -> dict[str, jax.Array]: ...
+
+
+class AdjustUpdates(Protocol):
+    """The updates of the parameters, changed after the optimiser."""
+
+    def __call__(self, updates: Params, state: MethodState, /) -> Params: ...
+
+
+class CriticInput(Protocol):
+    """`[..., observations + critic_extra]`, what critics see beside the action.
+
+    Of a stored transition its extras are given as the context.
+    """
+
+    def __call__(self, context: Context, observation: jax.Array, /) -> jax.Array: ...
+
+
+class Consolidate(Protocol):
+    """Parameters and state once a task's interactions are over."""
+
+    def __call__(
+        self,
+        key: jax.Array,
+        params: Params,
+        state: MethodState,
+        task: jax.Array,
+        tools: Tools,
+        /,
+    ) -> tuple[Params, MethodState]: ...
+
+
+class CandidatesOf(Protocol):
+    """Policies that are rolled out at the end of a task, to choose among them."""
+
+    def __call__(
+        self, params: Params, state: MethodState, task: jax.Array, /
+    ) -> Candidates: ...
+
+
+class EndTask(Protocol):
+    """Parameters and state after a task; the selection is None where none was made."""
+
+    def __call__(
+        self,
+        params: Params,
+        state: MethodState,
+        task: jax.Array,
+        selection: Selection | None,
+        /,
+    ) -> tuple[Params, MethodState]: ...
+
+
 class Method(NamedTuple):
     """A method as pure functions of one member of a population.
 
@@ -116,82 +274,39 @@ class Method(NamedTuple):
     the index in the sequence. Only the first five are needed.
 
     Attributes:
-      init: `key -> params, state`, before the first task.
-      distribution: `(params, state, context, observation) -> mean, log_std` of
-        the Gaussian before the squashing; observation `[..., observations]`.
-      policy: `(params, state, task) -> policy` for a task of the sequence, after
-        any number of finished tasks; one not yet seen gets the latest policy, or
-        the one that the method knows to belong to it.
-      act: `(policy, observation) -> mean, log_std`; a plain function, the same
-        object for all members.
-      size: `(params, state) -> []`, the numbers stored for all policies.
-      start_task: `(key, params, state, task) -> params, state`. Optimisers and
-        temperature start anew by themselves.
-      extras: `(key, state, extras, steps) -> extras [envs, ...]`, stored with the
-        transitions of a step. `steps` `[envs]` counts those of the running
-        episodes; `extras` is that of the step before, None in a task's first.
-      context: `(key, state, purpose, extras) -> context`, drawn for each update
-        and each acting step; `extras` `[batch, ...]` is that of the transitions.
-      penalty: `(key, params, state, context, observation, (mean, log_std)) ->
-        loss, metrics`, added to SAC's policy loss; the pair is what
-        `distribution` gave for the same arguments.
-      inspect: `(params, state, observation) -> metrics`, computed from a batch once
-        a progress report.
-      adjust_updates: `(updates, state) -> updates`, after the optimiser.
-      critic_input: `(context, observation) -> [..., observations + critic_extra]`,
-        what the critics see beside the action; of a stored transition its extras are
-        given as the context.
-      critic_extra: numbers in it beyond the observation.
+      critic_extra: numbers in `critic_input` beyond the observation.
       fresh_critic: whether the critics, too, start anew with each task.
-      consolidate: `(key, params, state, task, tools) -> params, state`, when a
-        task's interactions are over; or None.
-      offline: updates from the buffer after that, a share of the interactions. They
-        begin with fresh optimisers and temperature, and need `consolidate`.
+      offline: updates from the buffer after `consolidate`, which they need, a share of
+        the interactions. They begin with fresh optimisers and temperature.
       offline_sac: SAC's settings for these, from those of the run.
-      candidates: `(params, state, task) -> Candidates`, rolled out at the end of
-        each task, or None where nothing is to be chosen.
-      baseline: whether they are rolled out at a task's start, too.
+      baseline: whether candidates are rolled out at a task's start, too.
       in_budget: whether these interactions are part of the task's own.
       candidate_score: what a candidate is judged by: the return of its "episode", or,
         after as many steps as an episode has, that "since_reset", the latest reset.
-      end_task: `(params, state, task, Selection or None) -> params, state`.
     """
 
-    init: Callable[[jax.Array], tuple[Params, MethodState]]
-    distribution: Callable[..., tuple[jax.Array, jax.Array]]
-    policy: Callable[[Params, MethodState, jax.Array], Policy]
-    act: Callable[[Policy, jax.Array], tuple[jax.Array, jax.Array]]
-    size: Callable[[Params, MethodState], jax.Array]
-    start_task: Callable[..., tuple[Params, MethodState]] = (
-        lambda key, params, state, task: (params, state)
-    )
-    extras: Callable[..., Extras] = lambda *_: ()
-    context: Callable[..., Context] = lambda *_: ()
-    penalty: Callable[..., tuple[jax.Array, dict[str, jax.Array]]] = lambda *_: (
-        jnp.zeros(()),
-        {},
-    )
-    inspect: Callable[[Params, MethodState, jax.Array], dict[str, jax.Array]] = (
-        lambda *_: {}
-    )
-    adjust_updates: Callable[[Params, MethodState], Params] = lambda updates, state: (
-        updates
-    )
-    critic_input: Callable[[Context, jax.Array], jax.Array] = (
-        lambda context, observation: observation
-    )
+    init: Init
+    distribution: Distribution
+    policy: PolicyOf
+    act: Act
+    size: Size
+    start_task: StartTask = lambda key, params, state, task: (params, state)
+    extras: ExtrasOf = lambda *_: ()
+    context: ContextOf = lambda *_: ()
+    penalty: Penalty = lambda *_: (jnp.zeros(()), {})
+    inspect: Inspect = lambda *_: {}
+    adjust_updates: AdjustUpdates = lambda updates, state: updates
+    critic_input: CriticInput = lambda context, observation: observation
     critic_extra: int = 0
     fresh_critic: bool = False
-    consolidate: Callable[..., tuple[Params, MethodState]] | None = None
+    consolidate: Consolidate | None = None
     offline: float = 0.0
     offline_sac: Callable[[SacSettings], SacSettings] = lambda sac: sac
-    candidates: Callable[[Params, MethodState, jax.Array], Candidates] | None = None
+    candidates: CandidatesOf | None = None
     baseline: bool = False
     in_budget: bool = False
     candidate_score: CandidateScore = "episode"
-    end_task: Callable[..., tuple[Params, MethodState]] = (
-        lambda params, state, task, selection: (params, state)
-    )
+    end_task: EndTask = lambda params, state, task, selection: (params, state)
 
 
 def count(tree: Any) -> int:

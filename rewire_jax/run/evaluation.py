@@ -63,7 +63,7 @@ def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
         key = jax.random.key(0)
 
         def one(carry: Any, task: jax.Array) -> tuple[Any, jax.Array]:
-            params, method_state = method.start_task(key, *carry, task)
+            params, method_state = method.start_task(key, carry[0], carry[1], task)
             selection = None
             if method.candidates is not None:
                 valid = method.candidates(params, method_state, task).valid

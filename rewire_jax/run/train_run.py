@@ -177,7 +177,7 @@ class Run:
         plan, stage = self.plan, now.stage
         before = now.steps
         steps = self.due(before, plan.steps + plan.offline_steps, 1)
-        compiled = plan.program.offline_update._cache_size()  # type: ignore[attr-defined]
+        traces = plan.program.traces()
         state = plan.program.offline_update(
             plan.stacked, now.state, stage, plan.steps, before - plan.steps, steps
         )
@@ -187,7 +187,7 @@ class Run:
             "interactions": plan.interactions,
             "polishing": now.steps - plan.steps,
             "seconds": clock.perf_counter() - began,
-            "compile": plan.program.offline_update._cache_size() > compiled,  # type: ignore
+            "compile": plan.program.traces() > traces,
             "memory": memory_estimate.most_held(),
         }
         run_folder.append(self.folder, "timing.jsonl", [timing])

@@ -100,26 +100,30 @@ def build(
     """
     of = MemberFunctions(environment, make, spec, shape)
     method = make(spec, example)
-    loop, trial = _loop(of, method, mesh)
+    traces = population.Traces()
+    loop, trial = _loop(of, method, mesh, traces)
     over = functools.partial(population.over, mesh)
     return Program(
         init=over(of.init, 0),
-        consolidate=method.consolidate and over(of.consolidate, 0, 0, None, None),
+        consolidate=over(of.consolidate, 0, 0, None, None)
+        if method.consolidate
+        else None,
         offline_update=over(
-            of.offline_update, 0, 0, None, None, None, None, donate=(1,)
+            traces.of(of.offline_update), 0, 0, None, None, None, None, donate=(1,)
         ),
-        candidates=method.candidates and over(of.candidates, 0, 0, None),
+        candidates=over(of.candidates, 0, 0, None) if method.candidates else None,
         finish=over(of.finish, 0, 0, None, 0),
         policies=over(of.policies, 0, 0),
         size=over(of.size, 0, 0),
         baseline=method.baseline,
         trial=trial,
+        traces=lambda: traces.count,
         **loop._asdict(),
     )
 
 
 def _loop(
-    of: MemberFunctions, method: Method, mesh: Mesh
+    of: MemberFunctions, method: Method, mesh: Mesh, traces: population.Traces
 ) -> tuple[host_train_loop.Loop, Callable[..., rollout.Rollout]]:
     """The functions that step environments, and `Program.trial`."""
     environment = of.environment
@@ -129,25 +133,26 @@ def _loop(
             "--candidate-score since_reset: environments that are stepped on the host "
             "are scored by whole episodes alone",
         )
-        loop = host_train_loop.loop(of, method.act, mesh)
+        loop = host_train_loop.loop(of, method.act, mesh, traces)
         return loop, loop.rollout
+
+    act: Callable[..., Any] = method.act
 
     def play(score: CandidateScore) -> Callable[..., rollout.Rollout]:
         def episodes(tasks, policies, keys, count):
             sizes = keys.shape[1], count, mesh, score
-            function = rollout_function(environment, method.act, *sizes)
+            function = rollout_function(environment, act, *sizes)
             return function(tasks, policies, keys)
 
         return episodes
 
     over = functools.partial(population.over, mesh)
     begins = over(of.begin, 0, 0, 0, None, None)
-    trains = over(of.chunk, 0, 0, None, None, None, None, donate=(1,))
+    trains = over(traces.of(of.chunk), 0, 0, None, None, None, None, donate=(1,))
     loop = host_train_loop.Loop(
         begin=begins,
         chunk=trains,
         rollout=play("episode"),
         state_shape=functools.partial(jax.eval_shape, begins),
-        traces=trains._cache_size,  # type: ignore[attr-defined]
     )
     return loop, play(method.candidate_score)

@@ -43,7 +43,6 @@ class Loop(NamedTuple):
     chunk: Callable[..., tuple[train_loop.RunnerState, ChunkMetrics]]
     rollout: Callable[..., Rollout]
     state_shape: Callable[..., train_loop.RunnerState]
-    traces: Callable[[], int]
 
 
 class _Functions(NamedTuple):
@@ -72,18 +71,23 @@ class _Functions(NamedTuple):
     inspect: Callable[..., dict[str, jax.Array]]
 
 
-def loop(of: MemberFunctions, act: Callable[..., Any], mesh: Mesh) -> Loop:
+def loop(
+    of: MemberFunctions,
+    act: Callable[..., Any],
+    mesh: Mesh,
+    traces: population.Traces,
+) -> Loop:
     """The loop's functions.
 
     Args:
       of: functions of one member; its environment is stepped on the host.
       act: `Method.act`.
       mesh: the devices.
+      traces: counts those of what is called in training.
     """
     environment, shape = of.environment, of.shape
     assert isinstance(environment, HostEnvironment)
-    functions = _compile(of, mesh)
-    counted: list[Any] = [functions.act, functions.store_and_update]
+    functions = _compile(of, mesh, traces)
 
     def first(members, index, task):
         shaped = len(members.keys), shape.envs
@@ -114,11 +118,10 @@ def loop(of: MemberFunctions, act: Callable[..., Any], mesh: Mesh) -> Loop:
         chunk=functools.partial(_chunk, environment, functions, shape, mesh),
         rollout=functools.partial(play, environment, shape.envs, act),
         state_shape=state_shape,
-        traces=lambda: sum(function._cache_size() for function in counted),
     )
 
 
-def _compile(of: MemberFunctions, mesh: Mesh) -> _Functions:
+def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Functions:
     environment, shape = of.environment, of.shape
     length, size = environment.episode_length, (shape.envs, environment.action_size)
 
@@ -190,10 +193,10 @@ def _compile(of: MemberFunctions, mesh: Mesh) -> _Functions:
         begin=over(of.start, 0, 0, 0, None, 0),
         draws=over(draws, 0, None, None),
         # Called at each step, and so not through `shard_map`, which takes its time.
-        act=jax.jit(act),
+        act=jax.jit(traces.of(act)),
         # With overlap the former learner acts meanwhile, and must be left.
         store_and_update=over(
-            store_and_update,
+            traces.of(store_and_update),
             0,
             0,
             0,

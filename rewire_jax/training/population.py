@@ -1,5 +1,6 @@
 """Members of a population: configurations times seeds, and where they live."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -126,6 +127,23 @@ def mesh(members: int) -> Mesh:
     devices = jax.local_devices()
     number = next(n for n in range(len(devices), 0, -1) if members % n == 0)
     return Mesh(devices[:number], (_AXIS,))
+
+
+class Traces:
+    """How often functions were traced, which each of them is to be once."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def of(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, its traces counted."""
+
+        @functools.wraps(function)
+        def counted(*arguments: Any) -> Any:
+            self.count += 1
+            return function(*arguments)
+
+        return counted
 
 
 def place(tree: Any, mesh: Mesh) -> Any:
