@@ -297,7 +297,7 @@ def sweep(
         run_folder.compare(folder, plan.settings, "sweep")
         saved = run_folder.read_header(folder, "sweep")
         require(
-            saved["members"] == members and saved["halving"] == halving,
+            saved["members"] == told and saved["halving"] == halving,
             f"{folder} was started with other axes, seeds or halving: give the same "
             "again or name another --out",
         )
