@@ -4,7 +4,6 @@ Nothing is trained: every method is led through the scenarios' sequences with th
 profile's settings, and counts what it stores, as it does in a run.
 """
 
-import itertools
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from rewire_jax.training.run_setup import base_size, make_spec
 
 # Length of observations in the brax v1 of the paper's runs, where it is known for
 # certain and another than in brax v2.
-FORMER = {"halfcheetah": (18,)}
 TITLE = "Model size: most numbers stored in a run, divided by those of a plain policy"
 FORMULAS = {
     "ft1": "1",
@@ -44,8 +42,7 @@ SYMBOLS = (
     "of width w has P(w) = (o + 1) w + (L − 1) (w + 1) w + 2a (w + 1) numbers, P is "
     "P(n), and its head has H = 2a (n + 1) of them. K = 3 wirings and S = 4 head "
     "slots, but S = 2 in the robustness scenarios, whose tasks recur after two. "
-    "HalfCheetah's observations had 18 entries in the brax v1 of the paper's runs, "
-    "Ant's as many as here; Humanoid's there are not known for certain."
+    "Observations are those of brax.v1."
 )
 DIFFERENCES = (
     "Where the paper has another number:",
@@ -68,7 +65,7 @@ class ModelSizes:
 
 
 def measure(name: str) -> Iterator[dict[str, Any]]:
-    """A row for each method and length of observations.
+    """A row for each method.
 
     Args:
       name: of the scenario.
@@ -76,10 +73,9 @@ def measure(name: str) -> Iterator[dict[str, Any]]:
     scenario = rewire_jax.make_scenario(name)
     environment = scenario.environment
     paper = paper_results.sources(name)[0].results
-    lengths = [environment.observation_size, *FORMER.get(scenario.domain, ())]
-    for length, method in itertools.product(lengths, FORMULAS):
+    for method in FORMULAS:
         settings = rewire_jax.preset(scenario, method)
-        spec = make_spec(settings, environment)._replace(observations=length)
+        spec = make_spec(settings, environment)
         numbers = most_stored(method, spec, settings.options.checked())
         yield {
             "scenario": name,

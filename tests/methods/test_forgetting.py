@@ -198,7 +198,7 @@ def test_csp_plays_what_its_search_found(trained: Callable[[str], Trained]) -> N
     prepared = run_setup.prepare(settings("csp"), SCENARIO)
     learner = jax.eval_shape(prepared.program.init, prepared.stacked)
     path = run_state.kept(trained("csp").folder, None)
-    like = {"policy": (learner.params, learner.state)}
+    like = {"policy": (learner.params, learner.method_state)}
     _, state = checkpoint.load(path, like)[0]["policy"]
     for best, proposals in zip(state.best, state.proposals, strict=True):
         assert (best[-1] == proposals).all(axis=1).any()

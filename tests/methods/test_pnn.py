@@ -278,7 +278,7 @@ def test_policies_of_all_tasks_hold_the_columns_once():
         plan = prepare(replace(tiny(method="pnn"), seeds=3, tasks=tasks))
         learner = jax.eval_shape(plan.program.init, plan.stacked)
         policies = jax.eval_shape(plan.program.policies, plan.stacked, learner)
-        return size(policies), size(learner.state.columns)
+        return size(policies), size(learner.method_state.columns)
 
     for tasks in (1, 2, 3):
         policies, columns = bytes_of(tasks)
@@ -294,15 +294,17 @@ def test_policies_that_share_play_as_each_alone():
             lambda key, params, state, t=stage: pnn_of(plan).start_task(
                 key, params, state, t
             )
-        )(members.keys, learner.params, learner.state)
-        learner = learner._replace(params=params, state=state)
+        )(members.keys, learner.params, learner.method_state)
+        learner = learner._replace(params=params, method_state=state)
         learner = program.finish(members, learner, stage, None)
     keys = jax.vmap(lambda key: jax.random.split(key, len(plan.names)))(members.keys)
     together = program.rollout(
         tasks, program.policies(members, learner), keys, 2
     ).returns
     for place, row in itertools.product(range(plan.num_slots), range(len(plan.names))):
-        mine = jax.tree.map(lambda x, p=place: x[p], (learner.params, learner.state))
+        mine = jax.tree.map(
+            lambda x, p=place: x[p], (learner.params, learner.method_state)
+        )
         policy = pnn_of(plan).policy(*mine, jnp.asarray(row))
         stacked = jax.tree.map(lambda x: x[None], policy)
         stacked = map_own(lambda x: x[None], stacked)

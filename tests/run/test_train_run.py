@@ -54,7 +54,7 @@ def checkpoints(folder: Path) -> list[str]:
 def leaves(folder: Path, settings: Settings) -> list[np.ndarray]:
     prepared = run_setup.prepare(settings)
     learner = jax.eval_shape(prepared.program.init, prepared.stacked)
-    like = {"policy": (learner.params, learner.memory), "critic": learner.critic}
+    like = {"policy": (learner.params, learner.method_state), "critic": learner.critic}
     items, _ = checkpoint.load(run_state.kept(folder, None), like)
     return jax.tree.leaves(items)
 
@@ -300,12 +300,14 @@ def test_all_policies_are_one_function_of_what_was_learned(run: Path, stage) -> 
 def test_what_is_learned_can_be_taken_apart(run: Path) -> None:
     policies = rewire_jax.load_policies(run)
     first = jax.tree.map(lambda leaf: leaf[0], policies.members)
-    orders = first.memory.orders
+    orders = first.method_state.orders
     np.testing.assert_array_equal(
         np.sort(orders, axis=-1), np.broadcast_to(np.arange(16), orders.shape)
     )
     # Whoever has another task's wiring acts otherwise.
-    exchanged = first._replace(memory=first.memory._replace(orders=orders[::-1]))
+    exchanged = first._replace(
+        method_state=first.method_state._replace(orders=orders[::-1])
+    )
     seen = jnp.array([0.3, -0.2])
     assert not np.allclose(
         policies.act(first, 0, seen), policies.act(exchanged, 0, seen), atol=1e-4
