@@ -5,9 +5,9 @@ import pytest
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import to_json
+from rewire_jax.run import run_state
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.run_folder import HEADER, held
-from rewire_jax.training import run_setup
 from tests.tiny import tiny
 
 HEAD = {"settings": to_json(tiny()), "provenance": {"versions": {}, "commit": "abc"}}
@@ -68,7 +68,7 @@ def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> No
         head["provenance"]["versions"] = versions
         (tmp_path / HEADER).write_text(json.dumps(head))
         for read in (
-            lambda: run_setup.saved(tmp_path),
+            lambda: run_state.saved(tmp_path),
             lambda: run_folder.compare(tmp_path, tiny()),
         ):
             with pytest.raises(UserError, match=said) as caught:
