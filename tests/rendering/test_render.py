@@ -26,6 +26,8 @@ from tests.rendering.test_webpage import embedded, scene
 from tests.tiny import tiny
 
 STEPS = 12
+# A backend with links, from which geometries can be found.
+CHEETAH = "halfcheetah/forgetting", "positional"
 FEET = {"geom5", "geom8"}  # halfcheetah's
 SWEEP = {"kind": "sweep", "members": [{"values": {}}] * 2}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -37,6 +39,8 @@ def untrained(folder: Path, scenario: str, *, stage: int = 2, **more) -> Path:
     What is in `more` is added to its header.
     """
     settings = dataclasses.replace(tiny(scenario, "ft1"), tasks=3, envs=1, seed=5)
+    if scenario == CHEETAH[0]:
+        settings = dataclasses.replace(settings, backend=CHEETAH[1])
     plan = prepare(settings)
     header = {
         "settings": to_json(plan.settings),
@@ -65,12 +69,12 @@ def short(monkeypatch) -> None:
 @pytest.fixture(scope="module")
 def cheetah(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("rendering") / "run"
-    return untrained(folder, "halfcheetah/forgetting")
+    return untrained(folder, CHEETAH[0])
 
 
 def walked(run: Path, task: int, episode: int):
     """The same episode: positions of the links, frame by frame, and the return."""
-    scenario = make_scenario("halfcheetah/forgetting")
+    scenario = make_scenario(*CHEETAH)
     data = scenario.tasks[task].data
     act = rewire_jax.load_policy(run, task=task)
     states = [scenario.environment.reset(data, jax.random.key(episode))]
@@ -93,7 +97,7 @@ def test_a_page_shows_the_episode_that_is_played(
     assert len(found["position"]) == STEPS + 1
     assert made.returns == pytest.approx(returns, rel=1e-4)
     # Links are where their geometries are less these's own offsets, turned along.
-    system = make_scenario("halfcheetah/forgetting").tasks[1].data.physics
+    system = make_scenario(*CHEETAH).tasks[1].data.physics
     for frame in (0, STEPS):
         for place, name in enumerate(found["names"]):
             geom = int(name.removeprefix("geom"))
@@ -123,7 +127,7 @@ def test_an_episode_follows_from_its_number(
 
 
 def test_a_member_of_a_sweep_is_seen(short, tmp_path: Path) -> None:
-    sweep = untrained(tmp_path / "sweep", "halfcheetah/forgetting", **SWEEP)
+    sweep = untrained(tmp_path / "sweep", CHEETAH[0], **SWEEP)
     run_folder.write(batches_of(sweep, 1), {"size": 2, "batches": [[0, 1]]})
     out = tmp_path / "x.html"
     made = rewire_jax.render(sweep, task=1, member=1, out=out, seconds=0)
