@@ -126,6 +126,5 @@ def test_the_readme_gives_a_newcomer_the_two_commands_and_no_unknown_blocks() ->
     assert [code for _, code in blocks if code.startswith("make")] == [
         "make bench-brax\n",
         "make test\n",
-        "make docs\n",
     ]
     assert blocks[0][1].startswith("git clone https://")
