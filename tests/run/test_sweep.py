@@ -180,8 +180,8 @@ def kept(folder: Path) -> list[np.ndarray]:
     assert len(members) == len(variants)
     leaves = []
     for number, batch in enumerate(first["batches"]):
-        members = [members[n] for n in batch]
-        prepared = run_setup.prepare(settings, members=members, num_slots=first["size"])
+        chosen = [members[n] for n in batch]
+        prepared = run_setup.prepare(settings, members=chosen, num_slots=first["size"])
         path = folder / f"task-001/batch-{number:03d}"
         leaves += jax.tree.leaves(run_state.read_kept(path, 1, prepared))
     return leaves
