@@ -22,9 +22,10 @@ from rewire_jax.rendering.render import render
 from rewire_jax.reports.run_report import write_report
 from rewire_jax.reports.sweep_report import write_sweep_report
 from rewire_jax.run.evaluation import evaluate, info
+from rewire_jax.run.interrupts import Stopped
 from rewire_jax.run.policies import load_policies, load_policy
 from rewire_jax.run.sweep import sweep
-from rewire_jax.run.train_run import Stopped, train
+from rewire_jax.run.train_run import train
 from rewire_jax.training.presets import preset
 from rewire_jax.version import __version__
 

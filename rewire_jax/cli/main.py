@@ -355,10 +355,10 @@ def _ending(error: BaseException) -> tuple[str, int]:
     """The line in which a command ends, and its exit status."""
     if isinstance(error, UserError):
         return f"error: {error}", 2
-    if isinstance(error, train_run.Stopped):
+    if isinstance(error, interrupts.Stopped):
         return str(error), _INTERRUPTED
     if isinstance(error, KeyboardInterrupt):
-        stopped = isinstance(error.__context__, train_run.Stopped)  # and then again
+        stopped = isinstance(error.__context__, interrupts.Stopped)  # and then again
         return str(error.__context__) if stopped else "interrupted", _INTERRUPTED
     said = f"{type(error).__name__}: {error}".partition("\n")[0]
     if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in said:

@@ -10,6 +10,23 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+
+class Stopped(Exception):
+    """The run was interrupted and can be resumed; the message says how."""
+
+
+class Interrupt:
+    """What Ctrl-C asks of a run.
+
+    Attributes:
+      stopping: whether it is to stop after the running chunk.
+    """
+
+    def __init__(self) -> None:
+        self.stopping = False
 
 
 @contextmanager
@@ -43,3 +60,43 @@ def noticed(act: Callable[[int], None]) -> Iterator[None]:
         there.close()
         thread.join()
         here.close()
+
+
+@contextmanager
+def interruptible(
+    interrupt: Interrupt, folder: Path, say: Callable[[str], None]
+) -> Iterator[None]:
+    """Ctrl-C once: stop after the running chunk. Twice: stop at once.
+
+    Args:
+      interrupt: told of the first; the run looks at it after each chunk.
+      folder: of the run.
+      say: tells the user.
+
+    Raises:
+      Stopped: at once.
+    """
+
+    def handle(number: int, frame: Any) -> None:
+        if interrupt.stopping:
+            raise KeyboardInterrupt
+        interrupt.stopping = True
+
+    def tell(times: int) -> None:
+        if times == 1:
+            say("stopping after this chunk; Ctrl-C again: at once")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGINT, handle)
+    try:
+        with noticed(tell):
+            yield
+    except KeyboardInterrupt:
+        raise Stopped(
+            "stopped at once: continue from the newest checkpoint with --resume --out "
+            f"{folder}"
+        ) from None
+    finally:
+        signal.signal(signal.SIGINT, previous)

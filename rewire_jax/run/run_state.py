@@ -63,7 +63,7 @@ def start(plan: Plan) -> RunState:
 
 def interactions(standing: RunState, plan: Plan) -> int:
     """Of each member, in all tasks together."""
-    steps = min(standing.steps, plan.steps)
+    steps = min(standing.steps, plan.budget.steps)
     return standing.stage * plan.interactions + steps * plan.settings.envs
 
 

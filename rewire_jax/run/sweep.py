@@ -30,12 +30,13 @@ from rewire_jax.core.settings import Settings, require, to_json, validate
 from rewire_jax.envs.scenarios import Scenario, make_scenario
 from rewire_jax.methods import find_method
 from rewire_jax.run import loggers, run_state
+from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.ranking import rank
 from rewire_jax.run.run_state import RunState
 from rewire_jax.run.sweep_grid import configure, draws, grid, read
-from rewire_jax.run.train_run import Run, Stopped, interruptible
+from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
 from rewire_jax.training import memory_estimate, population
@@ -168,10 +169,10 @@ class Sweep:
                     now = self.gather(stage, plan)
                 return run.start(now)
 
-            with interruptible(run):
+            with interruptible(run.interrupt, folder, display.message):
                 # Where it stands is not kept here: what was learned before would be.
                 run.task(start(), self.ahead(stage, number, len(batches)))
-            if run.stopping:  # since the last chunk
+            if run.interrupt.stopping:  # since the last chunk
                 raise Stopped
 
     def subject(self, member: Member) -> loggers.Subject:

@@ -9,10 +9,10 @@ from jax.sharding import Mesh
 
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Candidates, CandidateScore, Method, Spec
+from rewire_jax.methods.base import Candidates, CandidateScore, Method
 from rewire_jax.training import host_train_loop, population, rollout, sac
 from rewire_jax.training.member_functions import MemberFunctions
-from rewire_jax.training.train_loop import ChunkMetrics, LoopConfig, RunnerState
+from rewire_jax.training.train_loop import ChunkMetrics, RunnerState
 
 
 class Program(NamedTuple):
@@ -80,26 +80,15 @@ def rollout_function(
 
 
 @functools.lru_cache
-def build(
-    environment: Environment | HostEnvironment,
-    make: Callable[[Spec, Any], Method],
-    spec: Spec,
-    shape: LoopConfig,
-    example: Any,
-    mesh: Mesh,
-) -> Program:
+def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
     """The functions of a run; runs alike in all but numbers share them.
 
     Args:
-      environment: of the scenario.
-      make: the method's constructor.
-      spec: sizes of the networks and of the sequence.
-      shape: sizes of the loop.
+      of: what a run does with one member.
       example: one member's method settings, for what is static about the method.
       mesh: the devices among which the members are shared out.
     """
-    of = MemberFunctions(environment, make, spec, shape)
-    method = make(spec, example)
+    method = of.make(of.spec, example)
     traces = population.Traces()
     loop, trial = _loop(of, method, mesh, traces)
     over = functools.partial(population.over, mesh)

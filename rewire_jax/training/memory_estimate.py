@@ -133,9 +133,9 @@ def need(plan: Plan) -> Need:
             peak(program.consolidate, plan.stacked, state, 0, 1) // plan.num_slots
         )
     selection = 0
-    if program.candidates and plan.rows:
+    if program.candidates and plan.budget.rows:
         chosen = jax.eval_shape(program.candidates, plan.stacked, fresh, 0)
-        selection = play(chosen.policies, plan.rows, settings.selection_episodes)
+        selection = play(chosen.policies, plan.budget.rows, settings.selection_episodes)
     if program.baseline:
         work.append(selection)
     environments = size(mine.collection) - size(mine.collection.buffer)

@@ -5,11 +5,22 @@ index, those of a step from the task's and the number of the step. So what is dr
 does not depend on chunks, on checkpoints, or on other members.
 """
 
+from enum import IntEnum
 from typing import NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 Keys = TypeVar("Keys", bound="NamedTuple")
+
+
+class Stream(IntEnum):
+    """What a member's key is folded with first; training has 1, the first state 0."""
+
+    TRAINING = 1
+    EVALUATION = 2
+    SELECTION = 3
+    CHOICE = 4
 
 
 class TaskKeys(NamedTuple):
@@ -89,10 +100,19 @@ def of_task(key: jax.Array, index: jax.Array) -> TaskKeys:
     A key is either split or folded, never both: `split(key)[i]` is the same as
     `fold_in(key, i)`.
     """
-    key = jax.random.fold_in(jax.random.fold_in(key, 1), index)
+    key = jax.random.fold_in(jax.random.fold_in(key, Stream.TRAINING), index)
     return named(TaskKeys, key)
 
 
 def of_step(key: jax.Array, time: jax.Array) -> StepKeys:
     """A step's keys, from `TaskKeys.steps` and the steps made before in the task."""
     return named(StepKeys, jax.random.fold_in(key, time))
+
+
+def of_rollout(
+    key: jax.Array, stream: int | jax.Array, number: int | jax.Array, rows: int
+) -> jax.Array:
+    """`[rows]`, a member's keys for rows of episodes, the `number`th of a stream."""
+    key = jax.random.fold_in(jax.random.fold_in(key, stream), number)
+    # Unlike those of a split, the first do not depend on how many there are.
+    return jax.vmap(lambda row: jax.random.fold_in(key, row))(jnp.arange(rows))

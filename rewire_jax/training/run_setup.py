@@ -1,4 +1,4 @@
-"""A run's plan: settings checked, sizes derived, functions built."""
+"""A run's plan: its settings checked, its sizes derived, its functions built."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,7 +16,23 @@ from rewire_jax.methods.base import Spec, count
 from rewire_jax.nn import networks
 from rewire_jax.training import compiled_functions, population, train_loop
 from rewire_jax.training.compiled_functions import Program
+from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Member, Members
+
+
+class Budget(NamedTuple):
+    """How long a task is, and what choosing between candidates takes.
+
+    Attributes:
+      steps: steps of all environments in a task.
+      offline_steps: after these, steps that only update from the buffer.
+      rows: slots for candidates that are rolled out side by side; 0 where nothing is
+        to be chosen.
+    """
+
+    steps: int
+    offline_steps: int
+    rows: int
 
 
 class Plan(NamedTuple):
@@ -28,12 +44,9 @@ class Plan(NamedTuple):
       tasks: of the sequence that is run, stacked on a leading axis, on the host.
       names: of these tasks.
       members: the members.
-      steps: steps of all environments in a task.
-      offline_steps: after these, steps that only update from the buffer.
-      rows: slots for candidates that are rolled out side by side; 0 where nothing is
-        to be chosen.
+      budget: of a task.
       spec: sizes of the networks and of the sequence.
-      stacked: the same, on a leading axis; fillers behind them make up the numbers.
+      stacked: the members on a leading axis; copies of the first fill it up.
       mesh: the devices.
       program: the compiled functions.
     """
@@ -43,9 +56,7 @@ class Plan(NamedTuple):
     tasks: Task
     names: tuple[str, ...]
     members: tuple[Member, ...]
-    steps: int
-    offline_steps: int
-    rows: int
+    budget: Budget
     spec: Spec
     stacked: Members
     mesh: Mesh
@@ -59,7 +70,7 @@ class Plan(NamedTuple):
     @property
     def interactions(self) -> int:
         """Of training, in a task."""
-        return self.steps * self.settings.envs
+        return self.budget.steps * self.settings.envs
 
 
 def make_spec(settings: Settings, environment: Environment | HostEnvironment) -> Spec:
@@ -93,16 +104,49 @@ def prepare(
       scenario: one of your own; otherwise made from the settings.
       members: the members, in place of one for each seed; their settings may differ
         from the run's in traced numbers, and are not checked here.
-      num_slots: for members; those beyond the members are filled.
+      num_slots: length of the members' axis; that of the members by default.
+
+    Raises:
+      UserError: a setting makes no sense.
+    """
+    settings, scenario = complete(settings, scenario)
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    members = members or population.cross([(settings.sac, settings.options)], seeds)
+    filled = [*members, *[members[0]] * (num_slots - len(members))]
+    mesh = population.mesh(len(filled))
+    functions = make_functions(settings, scenario)
+    sequence = scenario.tasks[: settings.tasks]
+    return Plan(
+        settings=settings,
+        scenario=scenario,
+        tasks=jax.tree.map(lambda *x: np.stack(x), *[t.data for t in sequence]),
+        names=tuple(task.name for task in sequence),
+        members=tuple(members),
+        budget=make_budget(settings, functions),
+        spec=functions.spec,
+        stacked=population.place(population.stack(filled), mesh),
+        mesh=mesh,
+        # The numbers among the options do not matter here; runs that differ in them
+        # alone share the program.
+        program=compiled_functions.build(
+            functions, jax.tree.map(lambda _: 0.0, settings.options), mesh
+        ),
+    )
+
+
+def complete(
+    settings: Settings, scenario: Scenario | None = None
+) -> tuple[Settings, Scenario]:
+    """The settings, checked and complete, and the scenario that they are for.
 
     Raises:
       UserError: a setting makes no sense.
     """
     validate(settings)
-    entry = find_method(settings.method)
+    options = find_method(settings.method).settings
     require(
-        isinstance(settings.options, entry.settings),
-        f"--method {settings.method} takes {entry.settings.__name__} as options, not "
+        isinstance(settings.options, options),
+        f"--method {settings.method} takes {options.__name__} as options, not "
         f"{type(settings.options).__name__}",
     )
     settings = dataclasses.replace(settings, options=settings.options.checked())
@@ -116,8 +160,16 @@ def prepare(
         settings.tasks <= len(scenario.tasks),
         f"--tasks {settings.tasks}: {scenario.name} has {len(scenario.tasks)}",
     )
+    return settings, scenario
+
+
+def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
+    """What a run does with one member; nothing is computed yet.
+
+    Raises:
+      UserError: the scenario cannot be run so.
+    """
     environment = scenario.environment
-    spec = make_spec(settings, environment)
     shape = train_loop.LoopConfig(
         envs=settings.envs,
         updates=settings.updates,
@@ -139,55 +191,48 @@ def prepare(
         f"--buffer {settings.buffer} is too short for an episode, which is taken up "
         f"again from it: give at least {least * settings.envs}",
     )
-    sequence = scenario.tasks[: settings.tasks]
-    seeds = range(settings.seed, settings.seed + settings.seeds)
-    members = members or population.cross([(settings.sac, settings.options)], seeds)
-    filled = [*members, *[members[0]] * (num_slots - len(members))]
-    mesh = population.mesh(len(filled))
-    stacked = population.place(population.stack(filled), mesh)
-    # Its numbers do not matter; runs that differ in them alone share the program.
-    example = jax.tree.map(lambda _: 0.0, settings.options)
-    built = compiled_functions.build(
-        environment, entry.make, spec, shape, example, mesh
-    )
-    method = entry.make(spec, settings.options)
-    number, rows = _selection(settings, built, stacked, hosted)
-    budget, round_ = settings.interactions, settings.update_every * settings.envs
+    make = find_method(settings.method).make
+    return MemberFunctions(environment, make, make_spec(settings, environment), shape)
+
+
+def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
+    """How the interactions of a task are spent.
+
+    Raises:
+      UserError: they do not suffice.
+    """
+    environment = functions.environment
+    method = functions.make(functions.spec, settings.options)
+    candidates = _count_candidates(settings, functions)
+    interactions = settings.interactions
+    round_ = settings.update_every * settings.envs
     if method.in_budget:
-        played = number * settings.selection_episodes
-        budget -= played * environment.episode_length
+        played = candidates * settings.selection_episodes
+        interactions -= played * environment.episode_length
         require(
-            budget >= settings.warmup + round_,
+            interactions >= settings.warmup + round_,
             f"--interactions {settings.interactions} must also pay for "
             f"{played} episodes of choosing between policies: raise it, or "
             "lower --selection-episodes or --warmup",
         )
-    return Plan(
-        settings=settings,
-        scenario=scenario,
-        tasks=jax.tree.map(lambda *x: np.stack(x), *[t.data for t in sequence]),
-        names=tuple(task.name for task in sequence),
-        members=tuple(members),
-        steps=budget // round_ * settings.update_every,
+    # Rows for nothing let the compiled function of an evaluation serve here, too.
+    same = settings.selection_episodes == settings.eval_episodes
+    hosted = isinstance(environment, HostEnvironment)
+    alike = candidates and same and not hosted
+    return Budget(
+        steps=interactions // round_ * settings.update_every,
         offline_steps=-(
             -int(method.offline * settings.interactions) // settings.updates
         ),
-        rows=rows,
-        spec=spec,
-        stacked=stacked,
-        mesh=mesh,
-        program=built,
+        rows=max(candidates, settings.tasks) if alike else candidates,
     )
 
 
-def _selection(
-    settings: Settings, built: Program, stacked: Members, hosted: bool
-) -> tuple[int, int]:
-    """How many candidates there are, and the rows to play them in."""
-    if built.candidates is None or not settings.selection_episodes:
-        return 0, 0
-    learner = jax.eval_shape(built.init, stacked)
-    number = jax.eval_shape(built.candidates, stacked, learner, 0).valid.shape[1]
-    # Some rows for nothing, where that lets an evaluation's compiled function serve.
-    same = settings.selection_episodes == settings.eval_episodes
-    return number, max(number, settings.tasks) if same and not hosted else number
+def _count_candidates(settings: Settings, functions: MemberFunctions) -> int:
+    """How many policies the method has rolled out at the end of a task."""
+    method = functions.make(functions.spec, settings.options)
+    if method.candidates is None or not settings.selection_episodes:
+        return 0
+    member = Members(jax.random.key(0), settings.sac, settings.options)
+    learner = jax.eval_shape(functions.init, member)
+    return len(jax.eval_shape(functions.candidates, member, learner, 0).valid)

@@ -220,7 +220,7 @@ def short(method: str, seed: int, seeds: int):
         if program.consolidate:
             learner = program.consolidate(members, state, index, 24)
             state = state._replace(learner=learner)
-        if prepared.offline_steps:
+        if prepared.budget.offline_steps:
             state = program.offline_update(members, state, index, 24, 0, 2)
         learner = program.finish(members, state.learner, index, None)
     return learner, reports, program.policies(members, learner)

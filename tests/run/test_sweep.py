@@ -26,7 +26,7 @@ from rewire_jax.methods.rewire import RewireSettings, rewire
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 from rewire_jax.nn.permutation import permute
-from rewire_jax.run import run_state, sweep, sweep_grid, train_run
+from rewire_jax.run import interrupts, run_state, sweep, sweep_grid, train_run
 from rewire_jax.storage import run_folder
 from rewire_jax.training import run_setup
 from tests.tiny import flags, tiny
@@ -426,7 +426,7 @@ def test_a_sweep_stops_when_asked_to(
     )
     with monkeypatch.context() as patch:
         patch.setattr(train_run.Run, name, interrupted)
-        with pytest.raises(train_run.Stopped, match="same command with --resume"):
+        with pytest.raises(interrupts.Stopped, match="same command with --resume"):
             run_sweep(tmp_path / "sweep", settings, **options)
     assert not (tmp_path / "sweep/task-000/batch-001").exists()
     run_sweep(tmp_path / "sweep", settings, **options, resume=True)

@@ -20,7 +20,7 @@ from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.envs.vector_env import VectorEnv, open_lanes
 from rewire_jax.methods import find_method
-from rewire_jax.run import train_run
+from rewire_jax.run import interrupts, train_run
 from rewire_jax.training import exploration, host_episodes, train_loop
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import Plan, prepare
@@ -398,7 +398,7 @@ def test_what_is_needed_within_a_task_is_saved(method, overlap, tmp_path, monkey
 
     with monkeypatch.context() as patch:
         patch.setattr(train_run.Run, "chunk", stopping)
-        with pytest.raises(train_run.Stopped):
+        with pytest.raises(interrupts.Stopped):
             train_run.train(made, tmp_path / "stopped", scenario=scenario)
     assert list((tmp_path / "stopped" / "checkpoints").glob("task-001-step-*"))
     open_lanes.cache_clear()
@@ -452,7 +452,7 @@ def test_updates_follow_every_so_many_steps():
     assert due == [12, 16, 20, 24, 28]
     assert [shape.before(steps) for steps in due] == [0, 7, 14, 21, 28]
     plan = planned(interactions=163)
-    assert plan.steps == 160  # a task ends with updates
+    assert plan.budget.steps == 160  # a task ends with updates
 
 
 def test_overlap_needs_something_to_overlap():

@@ -1,0 +1,191 @@
+"""What a run tells while it goes on: rows of its tables, logs and the display."""
+
+from pathlib import Path
+
+import numpy as np
+
+from rewire_jax.run import run_state
+from rewire_jax.run.loggers import Loggers
+from rewire_jax.run.progress import Progress
+from rewire_jax.run.run_state import RunState
+from rewire_jax.storage import run_folder
+from rewire_jax.training import memory_estimate, rollout
+from rewire_jax.training.run_setup import Plan, base_size
+from rewire_jax.training.train_loop import ChunkMetrics
+
+
+class Recorder:
+    """Writes a run's tables; holds no learning state.
+
+    Attributes:
+      ahead: populations that are still to be trained on a task after this one, from
+        which the time left is estimated.
+    """
+
+    def __init__(self, plan: Plan, folder: Path, progress: Progress, logs: Loggers):
+        self.plan = plan
+        self.folder = folder
+        self.progress = progress
+        self.logs = logs
+        self.ahead = 0
+
+    def chunk(
+        self,
+        now: RunState,
+        report: ChunkMetrics,
+        seconds: float,
+        compiled: bool,
+        steps: int,
+    ) -> None:
+        """A chunk of training.
+
+        Args:
+          now: where the run stands after it.
+          report: what happened, as NumPy arrays `[members]`.
+          seconds: that it took.
+          compiled: whether these include compiling.
+          steps: steps of all environments.
+        """
+        plan, settings, stage = self.plan, self.plan.settings, now.stage
+        interactions = now.steps * settings.envs
+        rows = self._training_rows(now, report, steps)
+        run_folder.append(self.folder, "training.jsonl", rows)
+        self._timing(now, interactions, seconds, compiled)
+        known = ("stage", "member", "seed", "interactions")
+        for place, row in enumerate(rows):
+            numbers = {name: x for name, x in row.items() if name not in known}
+            total = run_state.interactions(now, plan)
+            self.logs.scalars(place, "training", numbers, total)
+        rate = steps * settings.envs * len(rows) / seconds
+        # As if steps that only update took as long as the others.
+        whole = plan.budget.steps + plan.budget.offline_steps
+        left = (whole * (self.ahead + 1) - now.steps) * settings.envs
+        length = plan.scenario.environment.episode_length
+        self.progress.update(
+            stage,
+            interactions,
+            # Few steps end an episode: show what their reward makes in a whole one.
+            [_finite(float(x) / steps * length) for x in report.rewards[: len(rows)]],
+            rate,
+            None if compiled else left * len(rows) / rate,
+        )
+
+    def _training_rows(
+        self, now: RunState, report: ChunkMetrics, steps: int
+    ) -> list[dict[str, float | None]]:
+        """A row for each member: means over a chunk of so many steps."""
+        rows = []
+        for place, member in enumerate(self.plan.members):
+            ended = int(report.episodes[place])
+            updates = max(float(report.updates[place]), 1.0)
+            row: dict[str, float | None] = {
+                "stage": now.stage,
+                "member": member.number,
+                "seed": member.seed,
+                "interactions": now.steps * self.plan.settings.envs,
+                "return": _finite(float(report.returns[place]) / ended)
+                if ended
+                else None,
+                "reward": _finite(float(report.rewards[place]) / steps),
+            }
+            for name, solved in rollout.named(report.successes).items():
+                row[name] = float(solved[place]) / ended if ended else None
+            for name, total in report.metrics.items():
+                row[name] = _finite(float(total[place]) / updates)
+            for name, values in report.inspected.items():
+                row[name] = _finite(float(values[place]))
+            rows.append(row)
+        return rows
+
+    def offline(self, now: RunState, seconds: float, compiled: bool) -> None:
+        """Updates without interactions; arguments as above."""
+        plan = self.plan
+        done = now.steps - plan.budget.steps
+        self._timing(now, plan.interactions, seconds, compiled, polishing=done)
+        share = done / plan.budget.offline_steps
+        self.progress.update(
+            now.stage,
+            plan.interactions,
+            [None] * len(plan.members),
+            rate=None,
+            note=f"updates without interactions: {share:.0%}",
+        )
+
+    def _timing(
+        self,
+        now: RunState,
+        interactions: int,
+        seconds: float,
+        compiled: bool,
+        **more: int,
+    ) -> None:
+        row = {
+            "stage": now.stage,
+            "interactions": interactions,
+            **more,
+            "seconds": seconds,
+            "compile": compiled,
+            "memory": memory_estimate.most_held(),
+        }
+        run_folder.append(self.folder, "timing.jsonl", [row])
+
+    def frozen(self, now: RunState, active: np.ndarray) -> None:
+        """Tells of members that are `active` `[members]` no more."""
+        for place, member in enumerate(self.plan.members):
+            if now.active[place] and not active[place]:
+                self.progress.message(
+                    f"{member.name}: a value is not finite in task {now.stage}; it is "
+                    "updated no more, try lower learning rates"
+                )
+
+    def evaluation(
+        self, now: RunState, stage: int, scores: dict[str, np.ndarray]
+    ) -> None:
+        """The returns of all tasks.
+
+        Args:
+          now: where the run stands.
+          stage: the latest finished task; -1 before the first.
+          scores: `[members, tasks]` by name.
+        """
+        plan, settings = self.plan, self.plan.settings
+        sizes = np.asarray(plan.program.size(plan.stacked, now.learner))
+        selection = np.asarray(now.selection)
+        interactions = (stage + 1) * plan.interactions
+        rows = [
+            {
+                "stage": stage,
+                "task": index,
+                "name": plan.names[index],
+                "member": member.number,
+                "seed": member.seed,
+                "episodes": settings.eval_episodes,
+                "interactions": {
+                    "training": interactions,
+                    "selection": int(selection[place]),
+                },
+                "diverged": not bool(now.active[place]),
+                "model_size": int(sizes[place]) / base_size(plan.spec),
+            }
+            | {name: _finite(float(x[place, index])) for name, x in scores.items()}
+            for place, member in enumerate(plan.members)
+            for index in range(settings.tasks)
+        ]
+        run_folder.append(self.folder, "results.jsonl", rows)
+        for place in range(len(plan.members)):
+            known = {
+                f"{name}/{index:02d}-{task}": _finite(float(x[place, index]))
+                for name, x in scores.items()
+                for index, task in enumerate(plan.names)
+            }
+            self.logs.scalars(place, "evaluation", known, interactions)
+
+    def finished(self, stage: int, returns: np.ndarray, seconds: float) -> None:
+        """A task is over, with these returns `[members]` in it."""
+        means = [_finite(float(mean)) for mean in returns]
+        self.progress.finish_task(stage, means, seconds)
+
+
+def _finite(value: float) -> float | None:
+    # JSON has no NaN.
+    return value if np.isfinite(value) else None
