@@ -89,4 +89,5 @@ def scenario(environment: Environment | HostEnvironment) -> Scenario:
         tasks=tuple(ScenarioTask(f"goal-{k}", k, t) for k, t in enumerate(TASKS)),
         distinct=len(TASKS),
         interactions=1_000,
+        preset="walk",
     )

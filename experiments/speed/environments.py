@@ -11,7 +11,8 @@ from experiments.host_loop import simulate
 from experiments.speed.part import Effort, Part, Row, show
 from experiments.speed.timing import Loop, in_turn
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.envs.scenarios import BRAX_BACKENDS, make_scenario
+from rewire_jax.envs.domains import BRAX_BACKENDS
+from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.envs.vector_env import VectorEnv
 from rewire_jax.reports import plots
 

@@ -73,17 +73,12 @@ def _make_domain(name: str, backend: str) -> Domain:
         for joint in system.mj_model.actuator_trnid[:, 0]
     ]
 
-    def make_task(change: TaskChange) -> Task:
-        task_parameters.check_physics(change, list(bodies))
-        return Task(
-            physics=_change_system(system, change, bodies, _RESIZED[name]),
-            action_scale=task_parameters.action_scale(joints, change.actions),
-            observation_mask=task_parameters.observation_mask(
-                environment.observation_size, change.hidden
-            ),
-        )
-
-    return Domain(environment, make_task)
+    return task_parameters.physical_domain(
+        environment,
+        joints,
+        list(bodies),
+        lambda change: _change_system(system, change, bodies, _RESIZED[name]),
+    )
 
 
 def _make_environment(env: PipelineEnv) -> Environment:

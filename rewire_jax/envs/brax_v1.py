@@ -59,20 +59,12 @@ def make_domain(name: str) -> Domain:
       UserError: the installed brax has no `brax.v1`.
     """
     systems = Systems(name)
-    environment = _make_environment(systems)
-    joints = _joint_of_each_action(systems.config)
-
-    def make_task(change: TaskChange) -> Task:
-        task_parameters.check_physics(change, list(systems.bodies))
-        return Task(
-            physics=systems.physics(change),
-            action_scale=task_parameters.action_scale(joints, change.actions),
-            observation_mask=task_parameters.observation_mask(
-                environment.observation_size, change.hidden
-            ),
-        )
-
-    return Domain(environment, make_task)
+    return task_parameters.physical_domain(
+        _make_environment(systems),
+        _joint_of_each_action(systems.config),
+        list(systems.bodies),
+        systems.physics,
+    )
 
 
 class Systems:

@@ -1,16 +1,12 @@
 """Sequences of tasks, as data: the paper's scenarios and one probe."""
 
-import difflib
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.envs import metaworld, probe
-from rewire_jax.envs.base import Domain, Environment, HostEnvironment, Task, TaskChange
-from rewire_jax.envs.task_parameters import check_names
+from rewire_jax.envs.base import Environment, HostEnvironment, Task, TaskChange
+from rewire_jax.envs.domains import DOMAINS, unknown
 
 
 @dataclass(frozen=True)
@@ -23,6 +19,9 @@ class ScenarioSpec:
       changes: the tasks in order; equal changes are the same task, met again.
       repeats: how often the whole list is gone through.
       interactions: environment steps of training for each task.
+      preset: name of the scenario whose settings `preset` gives this one, such as
+        "halfcheetah/forgetting"; its own by default, which for a scenario of one's
+        own means the defaults.
 
     Raises:
       UserError: a value that no scenario can have.
@@ -33,10 +32,11 @@ class ScenarioSpec:
     changes: tuple[TaskChange, ...]
     repeats: int
     interactions: int
+    preset: str = ""
 
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:
-            raise UserError(_unknown("domain", self.domain, list(DOMAINS)))
+            raise UserError(unknown("domain", self.domain, list(DOMAINS)))
         if not self.changes:
             raise UserError(f"Scenario {self.name!r} needs at least one change.")
         if self.repeats < 1:
@@ -48,6 +48,8 @@ class ScenarioSpec:
                 f"Scenario {self.name!r} needs interactions >= 1, not"
                 f" {self.interactions}."
             )
+        if self.preset and self.preset not in SCENARIOS:
+            raise UserError(unknown("preset", self.preset, list(SCENARIOS)))
         named = {change.name: change for change in self.changes}
         if any(named[change.name] != change for change in self.changes):
             raise UserError(f"Scenario {self.name!r} gives one name to two tasks.")
@@ -91,6 +93,7 @@ class Scenario:
       tasks: the whole sequence, repeats included.
       distinct: number of distinct tasks.
       interactions: environment steps of training for each task.
+      preset: name of the scenario whose settings `preset` gives this one.
     """
 
     name: str
@@ -101,6 +104,7 @@ class Scenario:
     tasks: tuple[ScenarioTask, ...]
     distinct: int
     interactions: int
+    preset: str
 
 
 def make_scenario(
@@ -122,12 +126,12 @@ def make_scenario(
     """
     if isinstance(spec, str):
         if spec not in SCENARIOS:
-            raise UserError(_unknown("scenario", spec, list(SCENARIOS)))
+            raise UserError(unknown("scenario", spec, list(SCENARIOS)))
         spec = SCENARIOS[spec]
     kind = DOMAINS[spec.domain]
     if backend is None or kind.backend in ("probe", "own"):
         backend = kind.backend
-    domain = kind.make(spec, backend, reward)
+    domain = kind.make(spec.domain, spec.changes, backend, reward)
     names = list(dict.fromkeys(change.name for change in spec.changes))
     changes = {change.name: change for change in spec.changes}
     data = {name: domain.make_task(changes[name]) for name in names}
@@ -144,6 +148,7 @@ def make_scenario(
         tasks=tuple(once * spec.repeats),
         distinct=len(names),
         interactions=spec.interactions,
+        preset=spec.preset or spec.name,
     )
 
 
@@ -158,66 +163,10 @@ def register_scenario(spec: ScenarioSpec) -> None:
     SCENARIOS[spec.name] = spec
 
 
-def register_domain(name: str, domain: Domain) -> None:
-    """Adds a domain of one's own, for specs to name; one of that name gives way."""
-    DOMAINS[name] = DomainKind(lambda spec, backend, reward: domain, "own")
-
-
 def list_scenarios() -> tuple[str, ...]:
     """The names of all known scenarios, sorted."""
     return tuple(sorted(SCENARIOS))
 
-
-def _unknown(kind: str, name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=3)
-    hint = f" Did you mean {' or '.join(close)}?" if close else ""
-    return f"Unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}."
-
-
-class DomainKind(NamedTuple):
-    """How a domain is made.
-
-    Attributes:
-      make: `(spec, backend, reward) -> Domain`.
-      backend: that it is made for where none is named; "probe" and "own" are the only
-        one of theirs.
-    """
-
-    make: Callable[[ScenarioSpec, str, str], Domain]
-    backend: str
-
-
-BRAX_BACKENDS = ("v1", "positional", "spring", "generalized", "mjx")
-
-
-def _make_brax(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
-    check_names("Brax backend", [backend], BRAX_BACKENDS)
-    # Brax takes seconds to import, and most commands do not need it.
-    if backend == "v1":
-        from rewire_jax.envs import brax_v1
-
-        return brax_v1.make_domain(spec.domain)
-    from rewire_jax.envs import brax
-
-    return brax.make_domain(spec.domain, backend)
-
-
-def _make_metaworld(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
-    names = dict.fromkeys(str(change.extra.get("task")) for change in spec.changes)
-    return metaworld.make_domain(backend, reward, tuple(names))
-
-
-def _make_probe(spec: ScenarioSpec, backend: str, reward: str) -> Domain:
-    return probe.make_domain(spec.domain)
-
-
-DOMAINS: dict[str, DomainKind] = {
-    "halfcheetah": DomainKind(_make_brax, "v1"),
-    "ant": DomainKind(_make_brax, "v1"),
-    "humanoid": DomainKind(_make_brax, "v1"),
-    "metaworld": DomainKind(_make_metaworld, "mujoco"),
-    **dict.fromkeys(probe.NAMES, DomainKind(_make_probe, "probe")),
-}
 
 _NORMAL = TaskChange("normal")
 _INVERTED = TaskChange("inverted_actions", actions={"*": -1.0})

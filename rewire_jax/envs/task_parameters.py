@@ -1,13 +1,14 @@
 """The parts of a `TaskChange` that mean the same in several domains."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.envs.base import TaskChange
+from rewire_jax.envs.base import Domain, Environment, Task, TaskChange
 
 ALL_JOINTS = "*"
 
@@ -54,6 +55,33 @@ def observation_mask(size: int, hidden: float) -> jax.Array:
     mask = np.repeat([0.0, 1.0], [zeros, size - zeros])
     drawn = np.random.RandomState(0).permutation(mask)
     return jnp.asarray(drawn.astype(np.float32))
+
+
+def physical_domain(
+    environment: Environment,
+    joints: Sequence[str],
+    bodies: Sequence[str],
+    physics: Callable[[TaskChange], Any],
+) -> Domain:
+    """A domain of bodies and joints.
+
+    Args:
+      environment: shared by all tasks.
+      joints: the joint that each action drives, in action order.
+      bodies: names of those that a change may name.
+      physics: of a task, from a valid change.
+    """
+
+    def make_task(change: TaskChange) -> Task:
+        check_physics(change, bodies)
+        size = environment.observation_size
+        return Task(
+            physics=physics(change),
+            action_scale=action_scale(joints, change.actions),
+            observation_mask=observation_mask(size, change.hidden),
+        )
+
+    return Domain(environment, make_task)
 
 
 def check_physics(change: TaskChange, bodies: Sequence[str]) -> None:

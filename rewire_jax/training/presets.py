@@ -4,7 +4,7 @@ import dataclasses
 from typing import Literal, get_args
 
 from rewire_jax.core.settings import SacSettings, Settings, require
-from rewire_jax.envs.scenarios import Scenario
+from rewire_jax.envs.scenarios import SCENARIOS, Scenario
 from rewire_jax.methods import find_method
 
 Profile = Literal["paper", "authors", "quick"]
@@ -35,11 +35,11 @@ _CONTINUAL_WORLD = SacSettings(
 
 
 def _sac(scenario: Scenario) -> SacSettings:
-    if scenario.domain == "metaworld":
+    if _on_continual_world(scenario):
         return _CONTINUAL_WORLD
-    if scenario.name not in _SAC:
+    if scenario.preset not in _SAC:
         return SacSettings()
-    published = _SAC[scenario.name]
+    published = _SAC[scenario.preset]
     policy, critic, scale, policy_delay, target_delay, multiplier = published
     return SacSettings(
         lr_policy=policy,
@@ -49,6 +49,11 @@ def _sac(scenario: Scenario) -> SacSettings:
         target_delay=target_delay,
         target_multiplier=multiplier,
     )
+
+
+def _on_continual_world(scenario: Scenario) -> bool:
+    """Whether Continual World's settings fit it."""
+    return SCENARIOS.get(scenario.preset, scenario).domain == "metaworld"
 
 
 def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
@@ -92,7 +97,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         paper_interactions=scenario.interactions,
         warmup=min(12_800, scenario.interactions // 4),
         sac=_sac(scenario),
-        options=entry.preset(scenario.name, period, profile),
+        options=entry.preset(scenario.preset, period, profile),
         selection_episodes=entry.selection_episodes or 32,
     )
     if profile == "authors":
@@ -105,7 +110,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
             eval_episodes=5_120,
             selection_episodes=entry.selection_episodes or 1_280,
         )
-    if scenario.domain == "metaworld":
+    if _on_continual_world(scenario):
         return _continual_world(paper)
     if profile != "quick":
         return paper

@@ -1,8 +1,9 @@
-import dataclasses
+from dataclasses import replace
 
 import pytest
 
-from rewire_jax.envs.scenarios import make_scenario
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs.scenarios import SCENARIOS, make_scenario
 from rewire_jax.methods import METHODS
 from rewire_jax.training.presets import preset
 
@@ -44,7 +45,7 @@ def test_quick_is_the_paper_profile_with_less_of_it():
 def test_authors_is_the_paper_profile_with_what_their_code_does(method):
     scenario = make_scenario("ant/forgetting")
     ours, theirs = (preset(scenario, method, p) for p in ("paper", "authors"))
-    assert theirs.sac == dataclasses.replace(
+    assert theirs.sac == replace(
         ours.sac, critic_entropy="batch_mean", policy_states="both"
     )
     assert theirs.eval_episodes == 512 * 10
@@ -74,3 +75,22 @@ def test_authors_on_continual_world():
     assert theirs.options.candidate_score == "episode"
     assert (theirs.eval_episodes, theirs.selection_episodes) == (10, 1)
     assert preset(scenario, "rewire", "authors").selection_episodes == 10
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_scenario_of_ones_own_has_the_settings_it_asks_for(method):
+    known = SCENARIOS["halfcheetah/forgetting"]
+    ours = replace(known, name="ours/forgetting", interactions=200_000)
+    asking = replace(ours, preset=known.name)
+    made, plain, published = (
+        preset(make_scenario(spec, "positional"), method)
+        for spec in (asking, ours, known)
+    )
+    assert (made.sac, made.options) == (published.sac, published.options)
+    assert (made.scenario, made.interactions) == ("ours/forgetting", 200_000)
+    assert plain.sac != published.sac
+
+
+def test_an_unknown_preset_is_refused_by_name():
+    with pytest.raises(UserError, match="halfcheetah/forgeting"):
+        replace(SCENARIOS["ant/forgetting"], preset="halfcheetah/forgeting")
