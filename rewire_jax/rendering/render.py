@@ -13,7 +13,7 @@ from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.geom_trajectory import Film
 from rewire_jax.envs.scenarios import Scenario, make_scenario
-from rewire_jax.run import run_state, sweep
+from rewire_jax.run import run_state, sweep_members
 from rewire_jax.run.policies import PolicyFunction, load_policy
 from rewire_jax.run.run_state import saved
 from rewire_jax.storage import checkpoint, run_folder
@@ -132,7 +132,7 @@ def render(
 def _learned(folder: Path, member: int | None) -> int:
     """How many tasks of the sequence the latest policy has learned."""
     if member is not None:
-        folder = sweep.find(folder, member, None).folder
+        folder = sweep_members.find(folder, member, None).folder
     return checkpoint.read_metadata(run_state.kept(folder, None))["stage"]
 
 

@@ -16,9 +16,9 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,14 +28,13 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
 from rewire_jax.core.settings import Settings, require, to_json, validate
 from rewire_jax.envs.scenarios import Scenario, make_scenario
-from rewire_jax.methods import find_method
 from rewire_jax.run import loggers, run_state
 from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.ranking import rank
 from rewire_jax.run.run_state import RunState
-from rewire_jax.run.sweep_grid import configure, draws, grid, read
+from rewire_jax.run.sweep_grid import draws, grid, make_members, read, values_of
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
@@ -265,32 +264,14 @@ def sweep(
     if not configurations:
         require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
         configurations = draws(given, random, settings) if random else grid(given)
-    settings, members = _members(settings, configurations)
+    settings, members = make_members(settings, configurations)
     scenario = scenario or make_scenario(
         settings.scenario, settings.backend, settings.reward
     )
     plan = prepare(settings, scenario, members[:1])
-    told = [
-        {
-            "member": member.number,
-            "configuration": member.number // settings.seeds,
-            "seed": member.seed,
-            "values": {name: read(member, name) for name in configurations[0]},
-        }
-        for member in members
-    ]
-    header = {
-        "kind": "sweep",
-        "settings": to_json(plan.settings),
-        "axes": given or _values(told),
-        "random": random,
-        "halving": halving,
-        "members": told,
-        "tasks": plan.names,
-        "spec": plan.spec._asdict(),
-        "episode_length": scenario.environment.episode_length,
-        "provenance": run_folder.provenance(),
-    }
+    header = _header(
+        plan, members, tuple(configurations[0]), given, random=random, halving=halving
+    )
     own = run_folder.held(folder, None if resume else header, "sweep")
     with ExitStack() as stack:
         population.at_first(lambda: stack.enter_context(own))
@@ -298,7 +279,7 @@ def sweep(
         run_folder.compare(folder, plan.settings, "sweep")
         saved = run_folder.read_header(folder, "sweep")
         require(
-            saved["members"] == told and saved["halving"] == halving,
+            all(saved[name] == header[name] for name in ("members", "halving")),
             f"{folder} was started with other axes, seeds or halving: give the same "
             "again or name another --out",
         )
@@ -321,61 +302,43 @@ def sweep(
     return folder
 
 
-def _members(
-    settings: Settings, configurations: Sequence[Mapping[str, float]]
-) -> tuple[Settings, tuple[Member, ...]]:
-    """The settings that a population shares, and its members."""
-    same = {frozenset(values) for values in configurations}
-    require(len(same) == 1, "all configurations need values for the same settings")
-    variants = [configure(settings, values) for values in configurations]
-    twice = len(variants) - len({(v.sac, v.options) for v in variants})
-    require(not twice, f"{twice} of the configurations are the same as others")
-    together = find_method(settings.method).together([v.options for v in variants])
-    pairs = [(v.sac, options) for v, options in zip(variants, together, strict=True)]
-    seeds = range(settings.seed, settings.seed + settings.seeds)
-    members = tuple(
-        member._replace(name=f"member {member.number}")
-        for member in population.cross(pairs, seeds)
-    )
-    return replace(variants[0], options=together[0]), members
+def _header(
+    plan: Plan,
+    members: Sequence[Member],
+    names: Sequence[str],
+    axes: Mapping[str, Any],
+    **asked: int,
+) -> dict[str, Any]:
+    """What the sweep's settings.json holds.
 
-
-class Found(NamedTuple):
-    """Where a member's policies are: folder, stage, and its place among so many."""
-
-    folder: Path
-    stage: int | None
-    place: int
-    num_slots: int
-
-
-def find(folder: Path, member: int, stage: int | None) -> Found:
-    """Where a member is after a stage, or after the latest one.
-
-    Raises:
-      UserError: it has not been trained so far.
+    Args:
+      plan: of any of the members.
+      members: all of them.
+      names: of the settings in which they differ.
+      axes: names of settings and their values, as given; none for those that the
+        members have.
+      asked: what else was asked for.
     """
-    begun = folder.glob("task-[0-9][0-9][0-9]/batches.json")
-    stages = sorted(int(path.parent.name[-3:]) for path in begun)
-    for each in reversed(stages) if stage is None else {stage}.intersection(stages):
-        batches, num_slots = read_batches(batches_of(folder, each))
-        for number, members in enumerate(batches):
-            inside = batch(folder, each, number)
-            if member in members and run_state.finished(inside, each):
-                return Found(inside, each, members.index(member), num_slots)
-    when = "any task" if stage is None else f"task {stage}"
-    raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
-
-
-def _values(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
-    """The values that each setting has among the members, in their order."""
-    values: dict[str, list[float]] = {}
-    for member in members:
-        for name, value in member["values"].items():
-            values.setdefault(name, [])
-            if value not in values[name]:
-                values[name].append(value)
-    return values
+    told = [
+        {
+            "member": member.number,
+            "configuration": member.number // plan.settings.seeds,
+            "seed": member.seed,
+            "values": {name: read(member, name) for name in names},
+        }
+        for member in members
+    ]
+    return {
+        "kind": "sweep",
+        "settings": to_json(plan.settings),
+        "axes": axes or values_of(told),
+        **asked,
+        "members": told,
+        "tasks": plan.names,
+        "spec": plan.spec._asdict(),
+        "episode_length": plan.scenario.environment.episode_length,
+        "provenance": run_folder.provenance(),
+    }
 
 
 def _wait(done: Callable[[], bool]) -> None:

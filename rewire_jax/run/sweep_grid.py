@@ -16,6 +16,8 @@ from rewire_jax.core.settings import (
     traced_fields,
     validate,
 )
+from rewire_jax.methods import find_method
+from rewire_jax.training import population
 from rewire_jax.training.population import Member
 
 Values = dict[str, float]
@@ -99,6 +101,36 @@ def configure(settings: Settings, values: Mapping[str, float]) -> Settings:
 def read(member: Member, name: str) -> float:
     """A member's value of a setting."""
     return getattr(member.sac if hasattr(member.sac, name) else member.options, name)
+
+
+def make_members(
+    settings: Settings, configurations: Sequence[Mapping[str, float]]
+) -> tuple[Settings, tuple[Member, ...]]:
+    """The settings that a population shares, and its members."""
+    same = {frozenset(values) for values in configurations}
+    require(len(same) == 1, "all configurations need values for the same settings")
+    variants = [configure(settings, values) for values in configurations]
+    twice = len(variants) - len({(v.sac, v.options) for v in variants})
+    require(not twice, f"{twice} of the configurations are the same as others")
+    together = find_method(settings.method).together([v.options for v in variants])
+    pairs = [(v.sac, options) for v, options in zip(variants, together, strict=True)]
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    members = tuple(
+        member._replace(name=f"member {member.number}")
+        for member in population.cross(pairs, seeds)
+    )
+    return dataclasses.replace(variants[0], options=together[0]), members
+
+
+def values_of(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """The values that each setting has among the members, in their order."""
+    values: dict[str, list[float]] = {}
+    for member in members:
+        for name, value in member["values"].items():
+            values.setdefault(name, [])
+            if value not in values[name]:
+                values[name].append(value)
+    return values
 
 
 def _check(name: str, value: float, kinds: Mapping[str, type]) -> None:

@@ -176,7 +176,7 @@ def kept(folder: Path) -> list[np.ndarray]:
     variants = [
         sweep_grid.configure(small(), values) for values in sweep_grid.grid(GRID)
     ]
-    settings, members = sweep._members(small(), sweep_grid.grid(GRID))
+    settings, members = sweep_grid.make_members(small(), sweep_grid.grid(GRID))
     assert len(members) == len(variants)
     leaves = []
     for number, batch in enumerate(first["batches"]):
@@ -214,11 +214,11 @@ DEVICES = """
 import json, sys
 import jax, jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
-from rewire_jax.run import sweep, sweep_grid
+from rewire_jax.run import sweep_grid
 from rewire_jax.training import run_setup
 from tests.run.test_sweep import GRID, small
 
-settings, members = sweep._members(small(), sweep_grid.grid(GRID))
+settings, members = sweep_grid.make_members(small(), sweep_grid.grid(GRID))
 made = run_setup.prepare(settings, members=members)
 learner = made.program.init(made.stacked)
 task = jax.tree.map(lambda leaf: leaf[0], made.tasks)
@@ -288,7 +288,7 @@ def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
     settings = dataclasses.replace(small(), sac=sac)
     axis = {"beta": [1, 2, 3, 4, 5, 6, 7]}
     folder = run_sweep(tmp_path / "s", settings, axes=axis, members_per_batch=4)
-    shared, members = sweep._members(settings, sweep_grid.grid(axis))
+    shared, members = sweep_grid.make_members(settings, sweep_grid.grid(axis))
     program = run_setup.prepare(shared, members=members[:4])[-1]
     traces = {
         name: function._cache_size()

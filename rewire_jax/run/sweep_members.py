@@ -1,0 +1,35 @@
+"""Where a member of a sweep is."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from rewire_jax.core.errors import UserError
+from rewire_jax.run import run_state
+from rewire_jax.storage.sweep_results import batch, batches_of, read_batches
+
+
+class Found(NamedTuple):
+    """Where a member's policies are: folder, stage, and its place among so many."""
+
+    folder: Path
+    stage: int | None
+    place: int
+    num_slots: int
+
+
+def find(folder: Path, member: int, stage: int | None) -> Found:
+    """Where a member is after a stage, or after the latest one.
+
+    Raises:
+      UserError: it has not been trained so far.
+    """
+    begun = folder.glob("task-[0-9][0-9][0-9]/batches.json")
+    stages = sorted(int(path.parent.name[-3:]) for path in begun)
+    for each in reversed(stages) if stage is None else {stage}.intersection(stages):
+        batches, num_slots = read_batches(batches_of(folder, each))
+        for number, members in enumerate(batches):
+            inside = batch(folder, each, number)
+            if member in members and run_state.finished(inside, each):
+                return Found(inside, each, members.index(member), num_slots)
+    when = "any task" if stage is None else f"task {stage}"
+    raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
