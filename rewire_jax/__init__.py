@@ -8,12 +8,12 @@ from rewire_jax.core.compilation_cache import keep_compiled
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import SacSettings, Settings
 from rewire_jax.envs.base import TaskChange
+from rewire_jax.envs.domains import register_domain
 from rewire_jax.envs.scenarios import (
     Scenario,
     ScenarioSpec,
     list_scenarios,
     make_scenario,
-    register_domain,
     register_scenario,
 )
 from rewire_jax.methods import register_method
@@ -26,6 +26,7 @@ from rewire_jax.run.interrupts import Stopped
 from rewire_jax.run.policies import load_policies, load_policy
 from rewire_jax.run.sweep import sweep
 from rewire_jax.run.train_run import train
+from rewire_jax.training.make_train import make_act, make_train
 from rewire_jax.training.presets import preset
 from rewire_jax.version import __version__
 
@@ -44,7 +45,9 @@ __all__ = [
     "list_scenarios",
     "load_policies",
     "load_policy",
+    "make_act",
     "make_scenario",
+    "make_train",
     "permute",
     "preset",
     "register_domain",

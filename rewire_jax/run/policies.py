@@ -12,27 +12,15 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Spec
-from rewire_jax.run import run_state, sweep
+from rewire_jax.run import run_state, sweep_members
 from rewire_jax.run.run_state import saved
-from rewire_jax.run.sweep import Found
 from rewire_jax.run.sweep_grid import configure
+from rewire_jax.run.sweep_members import Found
 from rewire_jax.storage import run_folder
+from rewire_jax.training.acting import Act, Learned, act_function, mean_action
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
 """`[..., observations]` -> actions `[..., actions]` in [-1, 1]."""
-
-
-class Learned(NamedTuple):
-    """What a member has learned; its policies are made from nothing else.
-
-    Attributes:
-      params: what its method trains.
-      method_state: what its method keeps from task to task; of `rewire`,
-        `orders` `[slots, L, n]`, the cached wirings.
-    """
-
-    params: Any
-    method_state: Any
 
 
 class Policies(NamedTuple):
@@ -47,7 +35,7 @@ class Policies(NamedTuple):
       tasks: names of the sequence.
     """
 
-    act: Callable[[Learned, jax.Array | int, jax.Array], jax.Array]
+    act: Act
     members: Learned
     seeds: tuple[int, ...]
     tasks: tuple[str, ...]
@@ -90,7 +78,7 @@ def load_policy(
             )
         if not 0 <= member < len(header["members"]):
             raise UserError(f"{folder} has no member {member}: see members.csv there")
-        found = sweep.find(folder, member, stage)
+        found = sweep_members.find(folder, member, stage)
         settings = configure(settings, header["members"][member]["values"])
     else:
         if member is not None:
@@ -104,7 +92,7 @@ def load_policy(
     method = find_method(settings.method).make(spec, settings.options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
     policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
-    return functools.partial(_act, method, policy)
+    return functools.partial(mean_action, method, policy)
 
 
 def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
@@ -126,24 +114,15 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
     header, settings, spec = _read(folder, "run")
     method = find_method(settings.method).make(spec, settings.options)
 
-    def act(member: Learned, task: jax.Array | int, observation: jax.Array):
-        policy = method.policy(member.params, member.method_state, jnp.asarray(task))
-        return _act(method, policy, observation)
-
     seeds = range(settings.seed, settings.seed + settings.seeds)
     members = _load(Found(folder, stage, 0, settings.seeds), method)
-    return Policies(act, members, tuple(seeds), tuple(header["tasks"]))
+    return Policies(act_function(method), members, tuple(seeds), tuple(header["tasks"]))
 
 
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
     """A folder's header, and what it says."""
     header, settings = saved(folder, kind)
     return header, settings, Spec(**header["spec"])
-
-
-def _act(method: Method, policy: Any, observation: jax.Array) -> jax.Array:
-    mean, _ = method.act(policy, observation)
-    return jnp.tanh(mean)
 
 
 def _load(found: Found, method: Method) -> Learned:

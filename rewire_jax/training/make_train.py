@@ -1,0 +1,279 @@
+"""Training as one pure function, from a key to arrays.
+
+`train` in `rewire_jax.run` makes the same steps chunk by chunk, so that it can show and
+save them; both are made of `MemberFunctions`.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from rewire_jax.core.settings import SacSettings, Settings, require
+from rewire_jax.envs.base import Environment, Task
+from rewire_jax.envs.scenarios import Scenario
+from rewire_jax.methods import find_method
+from rewire_jax.methods.base import Method, Selection
+from rewire_jax.training import random_keys, rollout, selection
+from rewire_jax.training.acting import Act, Learned, act_function
+from rewire_jax.training.member_functions import MemberFunctions
+from rewire_jax.training.population import Members
+from rewire_jax.training.random_keys import Stream
+from rewire_jax.training.run_setup import (
+    Budget,
+    complete,
+    make_budget,
+    make_functions,
+)
+from rewire_jax.training.sac import TrainState
+from rewire_jax.training.train_loop import ChunkMetrics
+
+
+class Curves(NamedTuple):
+    """Learning curves; a report covers `Settings.report_every` interactions.
+
+    Attributes:
+      interactions: `[tasks, reports]` int, of training in the task so far.
+      returns: `[tasks, reports]`, mean return of the training episodes that ended;
+        NaN where none did.
+      rewards: `[tasks, reports]`, mean reward of a step.
+      metrics: `[tasks, reports]` by name: of the updates their mean, of the method's
+        own the latest.
+    """
+
+    interactions: jax.Array
+    returns: jax.Array
+    rewards: jax.Array
+    metrics: dict[str, jax.Array]
+
+
+class Trained(NamedTuple):
+    """What training came to, as arrays.
+
+    Attributes:
+      returns: `[tasks + 1, tasks]`, mean return without exploration of each task (the
+        columns) before the first task and after each.
+      success: `Success` of the same shape, shares of the episodes; `()` where none is
+        known.
+      curves: of training.
+      learned: after the last task; `make_act` acts by it.
+      active: `[]` bool, False once a value was not finite: nothing was learned since.
+      selection: `[]` int, interactions spent on choosing between policies.
+    """
+
+    returns: jax.Array
+    success: Any
+    curves: Curves
+    learned: Learned
+    active: jax.Array
+    selection: jax.Array
+
+
+class Train(Protocol):
+    """Learns a sequence of tasks; pure, to be jitted and vmapped.
+
+    `sac` and `options` may be given with other numbers than the settings', traced ones
+    included: `jax.vmap` over them is a sweep.
+    """
+
+    def __call__(
+        self, key: jax.Array, sac: SacSettings | None = None, options: Any = None
+    ) -> Trained:
+        """What was learned with this key."""
+        ...
+
+
+def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
+    """Training as a pure function of a random key; nothing is written or shown.
+
+    The key `jax.random.key(seed)` gives the results of a run with this seed.
+
+    Args:
+      settings: of the run, for instance from `preset`. What is said of seeds,
+        checkpoints and `overlap` is not used.
+      scenario: one of your own; otherwise made from the settings.
+
+    Raises:
+      UserError: a setting makes no sense, or the scenario's environments are stepped
+        on the host.
+    """
+    settings, scenario = complete(settings, scenario)
+    environment = scenario.environment
+    require(
+        isinstance(environment, Environment),
+        f"{scenario.name} on {scenario.backend} is stepped on the host and cannot be "
+        "compiled: use train, which writes a folder",
+    )
+    functions = make_functions(settings, scenario)
+    sequence = [task.data for task in scenario.tasks[: settings.tasks]]
+    tasks = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sequence)
+    budget = make_budget(settings, functions)
+
+    def train(
+        key: jax.Array, sac: SacSettings | None = None, options: Any = None
+    ) -> Trained:
+        given = sac or settings.sac, options or settings.options
+        numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), given)
+        member = Members(key, *numbers)
+        return _Training(settings, functions, budget, tasks, member).run()
+
+    return train
+
+
+def make_act(settings: Settings, scenario: Scenario | None = None) -> Act:
+    """How to act by what `make_train` with the same arguments has learned.
+
+    Raises:
+      UserError: a setting makes no sense.
+    """
+    settings, scenario = complete(settings, scenario)
+    spec = make_functions(settings, scenario).spec
+    return act_function(find_method(settings.method).make(spec, settings.options))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Training:
+    """A member's training; its fields are what stays the same all along."""
+
+    settings: Settings
+    functions: MemberFunctions
+    budget: Budget
+    tasks: Task
+    member: Members
+
+    @property
+    def environment(self) -> Environment:
+        assert isinstance(self.functions.environment, Environment)
+        return self.functions.environment
+
+    @property
+    def method(self) -> Method:
+        return self.functions.method(self.member)
+
+    def run(self) -> Trained:
+        """Learns the sequence."""
+        start = (
+            self.functions.init(self.member),
+            jnp.asarray(True),
+            jnp.zeros((), jnp.int32),
+        )
+        # Stage -1 is before the first task; so evaluation is compiled but once.
+        stages = jnp.arange(-1, self.settings.tasks)
+        end, (returns, success, curves) = jax.lax.scan(self.stage, start, stages)
+        learner, active, spent = end
+        curves = jax.tree.map(lambda leaf: leaf[1:], curves)
+        learned = Learned(learner.params, learner.method_state)
+        return Trained(returns, success, curves, learned, active, spent)
+
+    def stage(self, carry: Any, index: jax.Array) -> tuple[Any, Any]:
+        """Learns a task, and plays all of them."""
+        learn = jax.jit(self.task)  # so that it is traced once for both uses
+
+        def skip(carry, index):
+            curves = jax.eval_shape(learn, carry, index)[1]
+            return carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), curves)
+
+        carry, curves = jax.lax.cond(index < 0, skip, learn, carry, index)
+        return carry, (*self.evaluate(carry[0], index), curves)
+
+    def task(self, carry: Any, index: jax.Array) -> tuple[Any, Curves]:
+        """Learns a task."""
+        learner, active, spent = carry
+        functions, member = self.functions, self.member
+        task = jax.tree.map(lambda leaf: leaf[index], self.tasks)
+        state = functions.begin(member, learner, active, index, task)
+        before = None
+        if self.method.baseline:
+            before, spent = self.select(state.learner, index, task, 0, spent)
+        steps, unit = self.budget.steps, self.settings.update_every
+        every = self.settings.report_every // (self.settings.envs * unit)
+        every = max(every, 1) * unit
+
+        def chunk(state, done):
+            due = jnp.minimum(every, steps - done)
+            state, report = functions.chunk(member, state, index, task, done, due)
+            return state, (self.report(report, due), done + due)
+
+        state, (reports, done) = jax.lax.scan(chunk, state, jnp.arange(0, steps, every))
+        curves = Curves(done * self.settings.envs, *reports)
+        if self.method.consolidate:
+            learner = functions.consolidate(member, state, index, jnp.asarray(steps))
+            state = state._replace(learner=learner)
+        if self.budget.offline_steps:
+            times = map(jnp.asarray, (steps, 0, self.budget.offline_steps))
+            state = functions.offline_update(member, state, index, *times)
+        learner, active = state.learner, state.active
+        after, spent = self.select(learner, index, task, 1, spent)
+        chosen_by = None if after is None else Selection(before, after)
+        learner = functions.finish(member, learner, index, chosen_by)
+        return (learner, active, spent), curves
+
+    @staticmethod
+    def report(
+        report: ChunkMetrics, steps: jax.Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Means over a chunk of so many steps, as in `Curves`."""
+        updates = jnp.maximum(report.updates, 1.0)
+        means = {name: total / updates for name, total in report.metrics.items()}
+        returns = jnp.where(report.episodes, report.returns / report.episodes, jnp.nan)
+        return returns, report.rewards / steps, means | report.inspected
+
+    def select(
+        self,
+        learner: TrainState,
+        index: jax.Array,
+        task: Task,
+        phase: int,
+        spent: jax.Array,
+    ) -> tuple[jax.Array | None, jax.Array]:
+        """As `rewire_jax.run.train_run.Run.select`."""
+        rows = self.budget.rows
+        if not rows:
+            return None, spent
+        candidates = self.functions.candidates(self.member, learner, index)
+
+        def played():
+            result = self.play(
+                self.method.candidate_score,
+                jax.tree.map(lambda leaf: jnp.stack([leaf] * rows), task),
+                selection.fill(candidates.policies, rows),
+                (Stream.SELECTION, 2 * index + phase),
+                self.settings.selection_episodes,
+            )
+            return selection.judge(result, candidates.valid, spent)
+
+        def skipped():
+            return jnp.zeros(len(candidates.valid)), spent
+
+        return jax.lax.cond(candidates.valid.any(), played, skipped)
+
+    def evaluate(
+        self, learner: TrainState, index: jax.Array | int
+    ) -> tuple[jax.Array, Any]:
+        """Mean returns `[tasks]` after a task, and shares of success."""
+        result = self.play(
+            "episode",
+            self.tasks,
+            self.functions.policies(self.member, learner),
+            (Stream.EVALUATION, index + 1),
+            self.settings.eval_episodes,
+        )
+        success = jax.tree.map(lambda x: x.mean(axis=1), result.success)
+        return result.returns.mean(axis=1), success
+
+    def play(
+        self,
+        score: str,
+        tasks: Task,
+        policies: Any,
+        place: tuple[Stream, jax.Array | int],
+        count: int,
+    ) -> rollout.Rollout:
+        """Episodes `[rows, count]` of policies in tasks, `[rows]` each."""
+        rows = len(jax.tree.leaves(tasks)[0])
+        keys = random_keys.of_rollout(self.member.keys, *place, rows)
+        policies, keys = jax.tree.map(lambda leaf: leaf[None], (policies, keys))
+        play, act = rollout.PLAYS[score], self.method.act
+        result = play(self.environment, act, tasks, policies, keys, count)
+        return jax.tree.map(lambda leaf: leaf[0], result)
