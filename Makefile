@@ -27,13 +27,13 @@ option = $(if $(strip $(2)),--$(1) $(2))
 .DELETE_ON_ERROR:
 .PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
 	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
-	follow-readme notebooks faults docs clean
+	follow-readme notebooks docs clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' Makefile
 	@echo 'bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS TASKS' \
 		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS,' \
-		'follow-readme ONLY SKIP FOLDER KEEP, faults KINDS.'
+		'follow-readme ONLY SKIP FOLDER KEEP.'
 
 setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
 
@@ -143,9 +143,6 @@ follow-readme: setup ## Follow README.md in an empty folder, word for word
 		$(call option,skip,$(SKIP)) \
 		$(call option,folder,$(FOLDER)) \
 		$(if $(KEEP),--keep))
-
-faults: setup ## Try faults of many kinds, which must cost no result (KINDS: some)
-	$(RUN) -m experiments.try_faults $(call option,kinds,$(subst $(comma), ,$(KINDS)))
 
 notebooks: setup ## Execute the notebooks anew, in place
 	$(RUN) -m notebooks.execute

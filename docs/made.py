@@ -4,7 +4,10 @@ import dataclasses
 import importlib
 import inspect
 import re
+import subprocess
+import sys
 import typing
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
@@ -256,6 +259,17 @@ def results(prefix: str) -> str:
     return "\n\n".join(parts) or "No result is committed yet."
 
 
+def cases(file: str) -> str:
+    """The tests in a file, and how many cases each has, as pytest collects them."""
+    words = ["-m", "pytest", "--collect-only", "--quiet", file]
+    found = subprocess.run(
+        [sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    counts = Counter(re.findall(rf"^{file}::test_(\w+)", found.stdout, re.M))
+    rows = [[name.replace("_", " "), str(count)] for name, count in counts.items()]
+    return table(["test", "cases"], [*rows, ["all", str(counts.total())]])
+
+
 def public(_: str) -> str:
     """Everything in `rewire_jax.__all__`, described from its docstring."""
     blocks = []
@@ -273,6 +287,7 @@ MADE: dict[str, Callable[[str], str]] = {
     each.__name__: each
     for each in (
         by_scenario,
+        cases,
         commands,
         default,
         experiments,

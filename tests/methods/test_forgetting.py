@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,12 +15,12 @@ import rewire_jax
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import TaskChange
 from rewire_jax.envs.scenarios import ScenarioSpec, make_scenario
-from rewire_jax.methods import METHODS, find_method
+from rewire_jax.methods import METHODS
 from rewire_jax.reports import metrics
 from rewire_jax.run import run_state
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
-from rewire_jax.training.compiled_functions import rollout_function
+from tests.compiles import assert_once, compiles
 
 # The goal is not observed. The last is opposite the first.
 GOALS = {"northeast": (0.5, 0.5), "northwest": (-0.5, 0.5), "southwest": (-0.5, -0.5)}
@@ -56,7 +56,7 @@ def settings(method: str) -> Settings:
         checkpoint_every=0,
         sac=dataclasses.replace(
             quick.sac,
-            # A width of its own, so that no other test's traces are counted.
+            # A width of its own, so that no other test has compiled the same.
             hidden=32,
             depth=2,
             batch_size=64,
@@ -76,45 +76,27 @@ class Trained(NamedTuple):
 
     folder: Path
     scores: np.ndarray
-    traces: dict[str, int]
+    compiled: Mapping[str, int]
 
 
-def play_functions(prepared: run_setup.Plan) -> dict[str, Callable]:
-    """Evaluation and selection, which may be one function and serve more methods."""
-    method = find_method(prepared.settings.method)
-    act = method.make(prepared.spec, prepared.settings.options).act
-    sizes = {
-        "evaluation": (len(GOALS), prepared.settings.eval_episodes),
-        "selection": (prepared.rows, prepared.settings.selection_episodes),
-    }
-    environment = prepared.scenario.environment
-    return {
-        name: rollout_function(environment, act, *size, prepared.mesh, "episode")
-        for name, size in sizes.items()
-    }
-
-
-def traces(prepared: run_setup.Plan) -> dict[str, int]:
-    functions = prepared.program._asdict() | play_functions(prepared)
-    return {
-        name: function._cache_size()
-        for name, function in functions.items()
-        if hasattr(function, "_cache_size")
-    }
+def num_plays(method: str) -> int:
+    """How many functions play: evaluation and selection may be one."""
+    prepared = run_setup.prepare(settings(method), SCENARIO)
+    options = prepared.settings
+    sizes = {(len(GOALS), options.eval_episodes)}
+    return len(sizes | {(prepared.rows, options.selection_episodes)})
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Trained]:
     @functools.cache
     def run(method: str) -> Trained:
-        prepared = run_setup.prepare(settings(method), SCENARIO)
-        before = traces(prepared)
-        folder = rewire_jax.train(
-            settings(method),
-            tmp_path_factory.mktemp(method) / "run",
-            scenario=SCENARIO,
-        )
-        counts = {n: count - before[n] for n, count in traces(prepared).items()}
+        with compiles() as counts:
+            folder = rewire_jax.train(
+                settings(method),
+                tmp_path_factory.mktemp(method) / "run",
+                scenario=SCENARIO,
+            )
         scores = np.full((SEEDS, 1 + len(GOALS), len(GOALS)), np.nan)
         for line in (folder / "results.jsonl").read_text().splitlines():
             row = json.loads(line)
@@ -183,15 +165,16 @@ def test_what_is_kept_stays_bit_for_bit(
 def test_one_trace_for_all_tasks(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
-    counts = dict(trained(method).traces)
-    # Other methods may have played with these before.
-    assert counts.pop("evaluation") <= 1
-    assert counts.pop("selection") <= 1
+    counts = trained(method).compiled
+    more = ["consolidate"] * (method in ("ewc", "packnet", "csp"))
+    more += ["candidates"] * (method in ("rewire", "csp"))
     # Only PackNet updates after its interactions.
-    assert counts.pop("offline_update") == (method == "packnet")
-    assert counts == dict.fromkeys(counts, 1)
-    assert ("consolidate" in counts) == (method in ("ewc", "packnet", "csp"))
-    assert ("candidates" in counts) == (method in ("rewire", "csp"))
+    more += ["offline_update"] * (method == "packnet")
+    assert_once(counts, *more)
+    others = {"consolidate", "candidates", "offline_update"} - set(more)
+    assert not others & counts.keys()
+    # Other methods may have played with these before.
+    assert counts["episodes"] <= num_plays(method)
 
 
 def test_csp_plays_what_its_search_found(trained: Callable[[str], Trained]) -> None:

@@ -23,7 +23,7 @@ from rewire_jax.reports.run_report import write_report
 from rewire_jax.run import run_state, train_run
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
-from rewire_jax.training.compiled_functions import rollout_function
+from tests.compiles import assert_once, compiles
 from tests.tiny import flags, tiny
 
 TABLES = ("results.jsonl", "training.jsonl")
@@ -202,40 +202,16 @@ def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     ]
     spec = ScenarioSpec("probe/eight", "reach", tuple(changes), 2, 640)
     scenario = make_scenario(spec)
-    # A width of its own, so that no other test's traces are counted.
+    # A width of its own, so that no other test has compiled the same.
     settings = tiny(scenario)
     settings = dataclasses.replace(
         settings, tasks=8, sac=dataclasses.replace(settings.sac, hidden=12)
     )
-    prepared = run_setup.prepare(settings, scenario)
-    made = rewire_jax.methods.find_method("rewire").make(
-        prepared.spec, prepared.settings.options
-    )
-    # Evaluation; selection of each of three modes. Other tests use them, too.
-    shared = [
-        rollout_function(
-            scenario.environment, made.act, *sizes, prepared.mesh, "episode"
-        )
-        for sizes in ((8, 4), (3, 2))
-    ]
-    before = [function._cache_size() for function in shared]
-    train_run.train(settings, tmp_path / "run", scenario=scenario)
-    assert [f._cache_size() - n for f, n in zip(shared, before, strict=True)] == [1, 1]
-    # The last two are not for this method, those before are not compiled.
-    others = (
-        "rollout",
-        "trial",
-        "baseline",
-        "state_shape",
-        "traces",
-        "consolidate",
-        "offline_update",
-    )
-    program = prepared.program._asdict()
-    program = {name: f for name, f in program.items() if name not in others}
-    assert {name: f._cache_size() for name, f in program.items()} == dict.fromkeys(
-        program, 1
-    )
+    with compiles() as counts:
+        train_run.train(settings, tmp_path / "run", scenario=scenario)
+    assert_once(counts, "candidates")
+    # Evaluation; selection of each of three modes.
+    assert counts["episodes"] == 2
     assert len(rows(tmp_path / "run")) == 9 * 8 * 2
 
 

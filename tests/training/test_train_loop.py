@@ -13,6 +13,7 @@ from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.training import compiled_functions as compiled
 from rewire_jax.training import population, train_loop
+from tests.compiles import assert_once, compiles
 
 SCENARIO = make_scenario("probe/reach")
 TASKS = [task.data for task in SCENARIO.tasks]
@@ -324,17 +325,13 @@ def test_the_buffer_holds_what_the_environments_did(program, whole):
 
 
 def sequence(method, tasks):
-    """Trains one task after the other, as a run does; the compiled functions."""
-    program, members = build(method), crowd(method)
-    # Updates without interactions are for methods that are not among these.
-    functions = {
-        name: function
-        for name, function in program._asdict().items()
-        if hasattr(function, "_cache_size") and name != "offline_update"
-    }
-    learner, active = program.init(members), np.ones(4, bool)
+    """Trains one task after the other, as a run does."""
+    # A number of members that no other test has.
+    program, number = build(method), 6
+    members = population.stack(population.cross(configurations(method), (1, 2, 3)))
+    learner, active = program.init(members), np.ones(number, bool)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *TASKS)
-    keys = jax.random.split(jax.random.key(0), (4, len(TASKS)))
+    keys = jax.random.split(jax.random.key(0), (number, len(TASKS)))
     returns = []
     for index in range(tasks):
         state = program.begin(members, learner, active, index, TASKS[index])
@@ -350,29 +347,18 @@ def sequence(method, tasks):
         returns.append(program.rollout(stacked, policies, keys, 2).returns)
         assert np.isfinite(program.size(members, learner)).all()
     assert np.isfinite(returns).all()
-    return functions
 
 
-def test_one_trace_for_all_tasks(program):
-    before = {
-        name: function._cache_size()
-        for name, function in program._asdict().items()
-        if hasattr(function, "_cache_size")
-    }
-    functions = sequence("ft1", len(TASKS))
-    assert functions["chunk"] is program.chunk
-    for name, function in functions.items():
-        # At most the first for this number of members.
-        assert function._cache_size() - before[name] <= 1, name
-
-
-@pytest.mark.slow
-def test_one_trace_for_all_tasks_of_rewire():
-    functions = sequence("rewire", len(TASKS))
-    # Crowd and single members, where another test has made these.
-    assert all(function._cache_size() in (1, 2) for function in functions.values())
-    again = {name: f._cache_size() for name, f in functions.items()}
-    assert {n: f._cache_size() for n, f in sequence("rewire", 2).items()} == again
+@pytest.mark.parametrize(
+    "method", ["ft1", pytest.param("rewire", marks=pytest.mark.slow)]
+)
+def test_one_trace_for_all_tasks(method):
+    with compiles() as counts:
+        sequence(method, len(TASKS))
+    assert_once(counts, "episodes", *["candidates"] * (method == "rewire"))
+    with compiles() as counts:
+        sequence(method, 2)
+    assert not counts
 
 
 def test_varied_environments_start_each_episode_from_a_reset_of_its_own():
