@@ -1,7 +1,6 @@
 """The `rewire-jax` command."""
 
 import contextlib
-import logging
 import os
 import signal
 import sys
@@ -30,9 +29,7 @@ def main(words: Sequence[str] | None = None) -> None:
     words = sys.argv[1:] if words is None else words
     debug = "--debug" in words
     if not debug:
-        # When a write fails, those beside it still report to Orbax, which has gone.
-        sys.unraisablehook = lambda _: None
-        logging.getLogger("asyncio").disabled = True
+        sys.unraisablehook = _unraisable
     try:
         with _stoppable():
             _run(words)
@@ -83,6 +80,16 @@ def _stoppable() -> Iterator[None]:
             over.set()
             if heard.is_set():  # The process ends, and has no more to say.
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _unraisable(report: "sys.UnraisableHookArgs") -> None:
+    """Prints an error in a thread of a library, but for those after a failed write.
+
+    Orbax closes its event loop when an array cannot be written, as on a full disk. Then
+    TensorStore has no loop to tell of the other arrays, and says so for each of them.
+    """
+    if str(report.exc_value) != "Event loop is closed":
+        sys.__unraisablehook__(report)
 
 
 def _ending(error: BaseException) -> tuple[str, int]:
