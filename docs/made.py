@@ -1,8 +1,10 @@
 """What the pages do not say by hand: `<!-- made: NAME ARGUMENT -->` stands for it."""
 
+import contextlib
 import dataclasses
 import importlib
 import inspect
+import io
 import re
 import subprocess
 import sys
@@ -18,6 +20,7 @@ import tyro
 import rewire_jax
 from experiments import suite
 from rewire_jax.cli import main
+from rewire_jax.cli.commands import COMMANDS, Flags
 from rewire_jax.core.settings import SacSettings, Settings, flag, traced_fields
 from rewire_jax.methods import METHODS
 
@@ -66,7 +69,8 @@ def values(kind: Any) -> str:
     """What an argument can be, in a word or its choices."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is Annotated:
-        return values(inner[0])
+        shown = [mark.metavar for mark in inner[1:] if hasattr(mark, "metavar")]
+        return shown[0] if shown else values(inner[0])
     if origin is Literal:
         return ", ".join(f"`{value}`" for value in inner)
     if origin in (Union, type(int | None)):
@@ -94,14 +98,15 @@ def argument(item: Item) -> str:
     return f"`{item.name.upper() if placed else flag(item.name)}`"
 
 
-def arguments(cls: type) -> str:
-    """A table of a command's arguments but the settings of a run."""
+def arguments(cls: type, besides: type | None = None) -> str:
+    """A table of a command's arguments but the settings of a run, and of `besides`."""
+    told = {"settings", *getattr(besides, "__dataclass_fields__", ())}
     return table(
         ["argument", "values", "default", "meaning"],
         [
             [argument(item), values(item.kind), shown(item.default), item.meaning]
             for item in items(cls)
-            if item.name != "settings"
+            if item.name not in told
         ],
     )
 
@@ -113,17 +118,19 @@ def prose(thing: Any) -> str:
 
 
 def usage(_: str) -> str:
-    """What `rewire-jax` says of itself."""
-    return f"```text\n{main._USAGE.strip()}\n```"
+    """What `rewire-jax --help` prints."""
+    shown = io.StringIO()
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(shown):
+        main.main(["--help"])
+    return f"```text\n{shown.getvalue().strip()}\n```"
 
 
 def commands(_: str) -> str:
-    """Each command of `rewire-jax`: the dataclass of its name in `cli`."""
+    """Each command of `rewire-jax`: its dataclass in `cli`."""
     parts = []
-    for name in main._COMMANDS:
-        cls = getattr(main, name.title())
+    for name, cls in COMMANDS.items():
         needs = " SCENARIO" if "settings" in cls.__annotations__ else ""
-        parts += [f"## `rewire-jax {name}{needs}`", prose(cls), arguments(cls)]
+        parts += [f"## `rewire-jax {name}{needs}`", prose(cls), arguments(cls, Flags)]
         if needs:
             parts += ["And [the settings of a run](settings.md), as flags."]
     return "\n\n".join(parts)
@@ -178,7 +185,7 @@ def settings(which: str) -> str:
                 item.meaning,
             ]
             for item in items(cls)
-            if item.name not in ("scenario", "sac", "options")
+            if item.name not in ("sac", "options")
         ],
     )
 

@@ -1,109 +1,133 @@
-"""The words that a command is given, as settings; or, in a line, what is wrong."""
+"""From the words of a command line to a command."""
 
-import argparse
 import contextlib
 import io
-import itertools
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import tyro
+from rich.text import Text
 
+from rewire_jax.cli.commands import COMMANDS, Command, Flags, Sweep, Train
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import require
-from rewire_jax.envs.scenarios import Scenario, make_scenario
+from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.training.presets import preset
 
 T = TypeVar("T")
 
+PROG = "rewire-jax"
+_HELP = {"-h", "--help"}
+_EXAMPLE = "halfcheetah/forgetting"  # of which `rewire-jax train --help` tells
+_AXES = {
+    "--k": ("--axis", "modes"),
+    "--alpha": ("--axis", "alpha"),
+    "--beta": ("--axis", "beta"),
+}
 
-def parse(kind: type[T], name: str, arguments: Sequence[str], **options: Any) -> T:
-    """Reads arguments with tyro.
+
+@dataclass(frozen=True, kw_only=True)
+class First(Flags):
+    """What must be known before all else: settings' defaults depend on it.
+
+    Attributes:
+      words: the command and its positional arguments.
+      method: of the settings.
+      profile: of the settings.
+      backend: of the settings.
+      reward: of the settings.
+      coordinator: of a sweep.
+      processes: of a sweep.
+      process: of a sweep.
+    """
+
+    words: tyro.conf.Positional[tuple[str, ...]] = ()
+    method: str = "rewire"
+    profile: str = "paper"
+    backend: str | None = None
+    reward: str = "v2"
+    coordinator: str | None = None
+    processes: int | None = None
+    process: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overview(Flags):
+    """Continual reinforcement learning with rewirable neurons, and its baselines.
+
+    `rewire-jax COMMAND --help` lists the flags of a command, and `rewire-jax train
+    SCENARIO --method METHOD --help` all settings with their defaults.
+
+    Attributes:
+      command: what to do.
+    """
+
+    command: Command
+
+
+def first(words: Sequence[str]) -> First:
+    """Reads what must be known first, and skips the rest.
 
     Raises:
-      UserError: an argument is unknown, missing or no value of its kind; tyro says
-        so in a box, of which this is the first part, and the flags in the second.
+      UserError: one of these flags has no value, or a wrong one.
     """
-    prog, box = f"rewire-jax {name}", io.StringIO()
+    known, _ = _parse(First, PROG, words, return_unknown_args=True, add_help=False)
+    return known
+
+
+def command(words: Sequence[str], known: First) -> Callable[[], None]:
+    """Reads a command and its arguments.
+
+    Args:
+      words: all of them.
+      known: what `first` read from them.
+
+    Raises:
+      UserError: the command or an argument is missing, unknown or wrong.
+    """
+    help_ = not _HELP.isdisjoint(words)
+    name, place = (*known.words, "", "")[:2]
+    kind = COMMANDS.get(name)
+    if kind is None:
+        if help_ and not name:
+            _parse(Overview, PROG, ["--help"])
+        wrong = f"unknown command {name!r}" if name else "no command"
+        choices = ", ".join(COMMANDS)
+        raise UserError(f"{wrong}: choose one of {choices}; see {PROG} --help")
+    prog, words = f"{PROG} {name}", list(words)
+    words.remove(name)
+    if kind not in (Train, Sweep):
+        return _parse(kind, prog, words)
+    require(bool(place) or help_, f"give a scenario after {name}: see {PROG} list")
+    scenario = make_scenario(place or _EXAMPLE, known.backend, known.reward)
+    settings = preset(scenario, known.method, known.profile)
+    default = kind(scenario=tyro.MISSING, settings=settings, out=tyro.MISSING)
+    if kind is Sweep:
+        words = [new for word in words for new in _AXES.get(word, (word,))]
+    return partial(_parse(kind, prog, words, default=default), scenario)
+
+
+def _parse(kind: type[T], prog: str, words: Sequence[str], **options: Any) -> Any:
+    """Parses with tyro, but tells what is wrong in one line.
+
+    Raises:
+      UserError: an argument is missing, unknown or wrong.
+    """
+    config = tyro.conf.OmitArgPrefixes, tyro.conf.PositionalMetavarFromFieldName
+    box = io.StringIO()
     try:
         with contextlib.redirect_stderr(box):
-            return tyro.cli(kind, prog=prog, args=list(arguments), **options)
+            return tyro.cli(kind, prog=prog, args=words, config=config, **options)
     except SystemExit as exit_:
         if not exit_.code:
             raise
-        # Drawn with minus signs and bars where the terminal has no better.
-        lines = [line.strip("│| ") for line in box.getvalue().splitlines()[1:]]
-        parts = itertools.groupby(lines, lambda line: bool(line.strip("─╰╯-+")))
-        said, hint, *_ = [*(" ".join(part) for text, part in parts if text), "", ""]
-        close = re.findall(r"--[a-z-]+", hint) if hint.startswith("Perhaps") else []
-        meant = f"; perhaps you meant {' or '.join(close)}" if close else ""
-        said = " ".join(said.split()).rstrip(".")
-        raise UserError(f"{said}{meant}; see {prog} --help") from None
-
-
-def peek(arguments: Sequence[str], **defaults: str | None) -> list[Any]:
-    """Values of flags that must be known before the rest is read."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name, default in defaults.items():
-        parser.add_argument(f"--{name}", default=default)
-    known, _ = parser.parse_known_args(arguments)
-    return [getattr(known, name) for name in defaults]
-
-
-def with_settings(
-    kind: Callable[..., T], name: str, arguments: Sequence[str]
-) -> tuple[Scenario, T]:
-    """Reads arguments that begin with a scenario and hold settings of a run.
-
-    Raises:
-      UserError: as in `parse`; or there is no scenario, or an unknown one.
-    """
-    # The settings' defaults depend on these, so they are read before the rest.
-    method, profile, backend, reward = peek(
-        arguments, method="rewire", profile="paper", backend=None, reward="v2"
-    )
-    given = bool(arguments) and not arguments[0].startswith("-")
-    require(
-        given or "--help" in arguments or "-h" in arguments,
-        f"{name} needs a scenario: see `rewire-jax list`",
-    )
-    which = arguments[0] if given else "halfcheetah/forgetting"
-    scenario = make_scenario(which, backend, reward)
-    default = preset(scenario, method, profile)
-    return (
-        scenario,
-        parse(
-            kind,  # type: ignore[arg-type]
-            f"{name} SCENARIO",
-            arguments[1:] if given else arguments,
-            default=kind(settings=default, out=tyro.MISSING),
-            config=(tyro.conf.OmitArgPrefixes,),
-        ),
-    )
-
-
-def read_axes(arguments: Sequence[str]) -> tuple[dict[str, list[float]], list[str]]:
-    """The axes of a sweep by name, and the other arguments.
-
-    Raises:
-      UserError: an axis lacks a name or values, or is named twice.
-    """
-    short = {"k": "modes", "alpha": "alpha", "beta": "beta"}
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    for name in short:
-        parser.add_argument(f"--{name}", nargs="*", action="append", default=[])
-    parser.add_argument("--axis", nargs="*", action="append", default=[])
-    known, others = parser.parse_known_args(arguments)
-    given = [[name, *values] for name in short for values in getattr(known, name)]
-    axes: dict[str, list[float]] = {}
-    for words in [*given, *known.axis]:
-        require(len(words) > 1, f"an axis needs a name and values, not {words}")
-        name, *values = words
-        name = short.get(name, name.lstrip("-").replace("-", "_"))
-        require(name not in axes, f"{name} is an axis twice")
-        try:
-            axes[name] = [float(value) for value in values]
-        except ValueError as error:
-            raise UserError(f"axis {name}: {error}") from None
-    return axes, others
+    # tyro has no public way to tell what is wrong but to print it: in a box, in parts
+    # with rules between them, with help texts indented.
+    lines = Text.from_ansi(box.getvalue()).plain.splitlines()[1:-1]
+    lines = [line[2:].rstrip("│ ") for line in lines if line[2:10].strip("│ ")]
+    parts = re.split(r"(?m)^[─-]+$", "\n".join(lines))
+    said = [" ".join(part.split()).rstrip(".") for part in parts if part.strip()]
+    raise UserError(". ".join(x for x in said if not x.startswith("Argument help")))

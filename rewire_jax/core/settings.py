@@ -138,7 +138,7 @@ class Settings:
       options: the method's own settings.
     """
 
-    scenario: str
+    scenario: Annotated[str, tyro.conf.Suppress]
     method: str
     profile: str
     backend: str

@@ -9,7 +9,7 @@ checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
 """
 
 import contextlib
-import fcntl
+import errno
 import hashlib
 import importlib.metadata
 import json
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from filelock import FileLock, Timeout
 
 from rewire_jax.core.errors import UserError, writing
 from rewire_jax.core.settings import Settings, flag, from_json, to_json
@@ -32,6 +33,7 @@ FORMAT = 1
 HEADER = "settings.json"
 TABLES = ("results.jsonl", "training.jsonl", "timing.jsonl")
 _LOCK = ".lock"
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP)  # of file systems without locks
 Mark = Sequence[Any] | int
 """Length of a table in bytes, and their SHA-256; older versions noted the length."""
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "mujoco", "orbax-checkpoint")
@@ -82,23 +84,34 @@ def held(
     else:
         _check_vacant(folder)
         make(folder)
-    with writing(folder):
-        lock = (folder / _LOCK).open("a")
-    with lock:
-        try:
-            # The system lets go of it when the process ends, however that is.
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UserError(
-                f"another process trains in {folder}: wait for its end or stop it, "
-                "then go on with --resume; or name another folder with --out"
-            ) from None
-        except OSError:  # a file system without locks
-            pass
+    lock = _lock(folder)
+    try:
         if header is not None:
             _check_vacant(folder)  # Another process may have been faster.
             write(folder / HEADER, {"format": FORMAT, **header})
         yield
+    finally:
+        lock.release()
+
+
+def _lock(folder: Path) -> FileLock:
+    """Locks a folder; the system unlocks it when the process ends, however that is."""
+    file = folder / _LOCK
+    lock = FileLock(file, timeout=0)
+    with writing(folder):
+        if file.is_symlink() or (file.exists() and not file.is_file()):
+            raise UserError(f"{file} is not a file: delete it, then try again")
+        try:
+            lock.acquire()
+        except Timeout:
+            raise UserError(
+                f"another process trains in {folder}: wait for its end or stop it, "
+                "then go on with --resume; or name another folder with --out"
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+    return lock
 
 
 def _check_vacant(folder: Path) -> None:

@@ -1,4 +1,9 @@
+import errno
+import fcntl
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,23 +21,75 @@ HEAD = {"settings": to_json(tiny()), "provenance": {"versions": {}, "commit": "a
 def test_one_at_a_time_has_a_folder(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with held(folder, HEAD):
-        with (
-            pytest.raises(UserError, match="another process trains"),
-            held(folder, None),
-        ):
-            raise AssertionError
-        with pytest.raises(UserError, match="another run"), held(folder, HEAD):
-            raise AssertionError
+        for header in (None, HEAD):
+            with pytest.raises(UserError), held(folder, header):
+                raise AssertionError
     with held(folder, None):
         pass
-    with pytest.raises(UserError, match="another run"), held(folder, HEAD):
+    with pytest.raises(UserError), held(folder, HEAD):
         raise AssertionError
+
+
+HOLDS = """
+import sys, time
+from pathlib import Path
+from rewire_jax.storage.run_folder import held
+with held(Path(sys.argv[1]), None):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_another_process_has_a_folder_until_it_is_killed(tmp_path: Path) -> None:
+    with held(tmp_path, HEAD):
+        pass
+    words = [sys.executable, "-c", HOLDS, str(tmp_path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        with pytest.raises(UserError, match="--resume"), held(tmp_path, None):
+            raise AssertionError
+        process.kill()
+    with held(tmp_path, None):
+        pass
+
+
+@pytest.mark.parametrize("kind", ["link", "broken link", "pipe", "folder"])
+def test_a_lock_that_is_no_file_is_left_alone(tmp_path: Path, kind: str) -> None:
+    folder, outside = tmp_path / "run", tmp_path / "outside"
+    folder.mkdir()
+    lock = folder / ".lock"
+    if kind == "link":
+        outside.write_text("thesis")
+    if kind == "pipe":
+        os.mkfifo(lock)
+    elif kind == "folder":
+        lock.mkdir()
+    else:
+        lock.symlink_to(outside)
+    before = outside.exists()
+    with pytest.raises(UserError, match=r"\.lock"), held(folder, HEAD):
+        raise AssertionError
+    assert outside.exists() == before
+    assert not before or outside.read_text() == "thesis"
+    assert [path.name for path in folder.iterdir()] == [".lock"]
+
+
+def test_a_file_system_without_locks_will_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with held(tmp_path, HEAD):
+        pass
 
 
 def test_a_start_that_was_cut_short_is_no_obstacle(tmp_path: Path) -> None:
     (tmp_path / ".lock").touch()
     (tmp_path / f".{HEADER}").write_text("{")
-    with pytest.raises(UserError, match="holds no run"), held(tmp_path, None):
+    with pytest.raises(UserError), held(tmp_path, None):
         raise AssertionError
     with held(tmp_path, HEAD):
         assert run_folder.read_header(tmp_path)["format"] == run_folder.FORMAT
