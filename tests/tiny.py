@@ -2,15 +2,15 @@
 
 import dataclasses
 
-import rewire_jax
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import Scenario, make_scenario
+from rewire_jax.training.presets import preset
 
 
 def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Settings:
     if isinstance(scenario, str):
         scenario = make_scenario(scenario)
-    quick = rewire_jax.preset(scenario, method, "quick")
+    quick = preset(scenario, method, "quick")
     return dataclasses.replace(
         quick,
         seeds=2,
