@@ -1,4 +1,4 @@
-"""What the pages do not say by hand: `<!-- made: NAME ARGUMENT -->` stands for it."""
+"""Generated parts of the pages: each replaces a `<!-- made: NAME ARGUMENT -->`."""
 
 import dataclasses
 import importlib
@@ -23,7 +23,7 @@ _EXAMPLE = "halfcheetah/forgetting"
 
 
 def fill(app: Any, page: str, source: list[str]) -> None:
-    """Sphinx's event `source-read`: puts in a page what is made."""
+    """Handles Sphinx's event `source-read`: fills in the generated parts of a page."""
     del app, page
     source[0] = re.sub(
         r"<!-- made: (\w+) ?(\S*) -->", lambda m: MADE[m[1]](m[2]), source[0]
@@ -37,7 +37,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 class Item(typing.NamedTuple):
-    """An argument or a setting, as its class describes it."""
+    """An argument or a setting, with the description from its class."""
 
     name: str
     kind: Any
@@ -46,7 +46,7 @@ class Item(typing.NamedTuple):
 
 
 def items(cls: type) -> Iterator[Item]:
-    """The fields of a dataclass that tyro makes arguments of."""
+    """The fields of a dataclass that tyro turns into arguments."""
     meanings: dict[str, str] = {}
     for each in reversed(cls.__mro__):
         for said in docstring_parser.parse(each.__doc__ or "").params:
@@ -60,7 +60,7 @@ def items(cls: type) -> Iterator[Item]:
 
 
 def values(kind: Any) -> str:
-    """What an argument can be, in a word or its choices."""
+    """The type of an argument in a word, or its choices."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is Annotated:
         return values(inner[0])
@@ -74,7 +74,7 @@ def values(kind: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as one types it; nothing where there is none."""
+    """A value as the user types it; empty if there is none."""
     if value is None or value is dataclasses.MISSING or value == ():
         return ""
     if isinstance(value, tuple):
@@ -85,14 +85,14 @@ def shown(value: Any) -> str:
 
 
 def argument(item: Item) -> str:
-    """The flag, or the name where an argument goes by its place."""
+    """The flag, or the name of a positional argument."""
     marks = getattr(item.kind, "__metadata__", ())
     placed = tyro.conf.Positional in marks
     return f"`{item.name.upper() if placed else flag(item.name)}`"
 
 
 def arguments(cls: type) -> str:
-    """A table of a command's arguments but the settings of a run."""
+    """A table of a command's arguments, without the settings of a run."""
     return table(
         ["argument", "values", "default", "meaning"],
         [
@@ -104,18 +104,18 @@ def arguments(cls: type) -> str:
 
 
 def prose(thing: Any) -> str:
-    """A docstring before its first section, flags as code."""
+    """A docstring up to its first section, with flags as code."""
     said = re.split(r"\n\n(?:Attributes|Raises):", inspect.getdoc(thing) or "")[0]
     return re.sub(r"(?<![`\w-])--[a-z][a-z-]*", r"`\g<0>`", said)
 
 
 def usage(_: str) -> str:
-    """What `rewire-jax` says of itself."""
+    """The usage text of `rewire-jax`."""
     return f"```text\n{main._USAGE.strip()}\n```"
 
 
 def commands(_: str) -> str:
-    """Each command of `rewire-jax`: the dataclass of its name in `cli`."""
+    """Each command of `rewire-jax`, from the dataclass of its name in `cli`."""
     parts = []
     for name in main._COMMANDS:
         cls = getattr(main, name.title())
@@ -140,7 +140,7 @@ def experiments(_: str) -> str:
 
 
 def targets(_: str) -> str:
-    """The Makefile's targets, as `make help` has them."""
+    """The Makefile's targets, as `make help` lists them."""
     found = re.findall(r"^([a-z-]+):.*## (.*)", (ROOT / "Makefile").read_text(), re.M)
     return table(
         ["command", "what it does"], [[f"`make {name}`", said] for name, said in found]
@@ -194,7 +194,7 @@ def methods(_: str) -> str:
 
 
 def by_scenario(_: str) -> str:
-    """What the paper profile has otherwise on some scenarios than on others."""
+    """Settings of the paper profile that differ between scenarios."""
     known = [rewire_jax.make_scenario(name) for name in rewire_jax.list_scenarios()]
     parts = []
     for title, method, part in (
@@ -224,7 +224,7 @@ def by_scenario(_: str) -> str:
 
 
 def default(name: str) -> str:
-    """A setting's default, and the profiles' where theirs differ."""
+    """A setting's default, and the profiles' values if they differ."""
     scenario = rewire_jax.make_scenario(_EXAMPLE)
     for method in METHODS:
         presets = [
@@ -243,7 +243,7 @@ def default(name: str) -> str:
 
 
 def results(prefix: str) -> str:
-    """The committed results whose names begin so; says so if there are none."""
+    """The committed results whose names start with `prefix`, or a note."""
     parts = []
     for path in sorted((ROOT / suite.RESULTS).glob(f"{prefix}*")):
         pages = path.glob("*.md") if path.is_dir() else [path]

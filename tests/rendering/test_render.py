@@ -132,7 +132,7 @@ def test_a_member_of_a_sweep_is_seen(short, tmp_path: Path) -> None:
     out = tmp_path / "x.html"
     made = rewire_jax.render(sweep, task=1, member=1, out=out, seconds=0)
     assert "member 1, after 2 of 3 tasks" in made.caption
-    with pytest.raises(UserError, match="task 2 .*--stage 1"):
+    with pytest.raises(UserError, match=r"task 2 .*--stage 1"):
         rewire_jax.render(sweep, task=2, member=1, out=out, seconds=0)
 
 
