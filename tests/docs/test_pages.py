@@ -75,9 +75,10 @@ def test_a_method_and_a_domain_of_ones_own_train(small: Path) -> None:
     "page", [page for page in pages(PYTHON) if page != "docs/extend.md"]
 )
 def test_python_blocks_run(small: Path, page: str) -> None:
-    settings = tiny("halfcheetah/forgetting")
-    settings = dataclasses.replace(settings, tasks=2, seeds=1)
-    rewire_jax.train(settings, RUN)
+    if RUN in (ROOT / page).read_text():  # The README trains it by a command.
+        settings = tiny("halfcheetah/forgetting")
+        settings = dataclasses.replace(settings, tasks=2, seeds=1)
+        rewire_jax.train(settings, RUN)
     execute(page)
 
 
