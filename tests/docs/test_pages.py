@@ -3,6 +3,7 @@
 import dataclasses
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
@@ -17,7 +18,7 @@ import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.envs import scenarios
 from rewire_jax.methods import METHODS
-from tests.tiny import tiny
+from tests.tiny import small, tiny
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
@@ -38,13 +39,17 @@ def execute(page: str) -> None:
         example.evaluate()
 
 
+def shrunk(run: Callable[..., Path]) -> Callable[..., Path]:
+    """`train` or `sweep` with budgets of seconds."""
+    return lambda settings, *rest, **more: run(small(settings), *rest, **more)
+
+
 @pytest.fixture
-def small(tmp_path: Path, monkeypatch):
-    """An empty folder, presets of seconds, and registries that are restored."""
+def newcomer(tmp_path: Path, monkeypatch):
+    """An empty folder, training of seconds, and registries that are restored."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        rewire_jax, "preset", lambda scenario, method, profile: tiny(scenario, method)
-    )
+    monkeypatch.setattr(rewire_jax, "train", shrunk(rewire_jax.train))
+    monkeypatch.setattr(rewire_jax, "sweep", shrunk(rewire_jax.sweep))
     with (
         mock.patch.dict(scenarios.DOMAINS),
         mock.patch.dict(scenarios.SCENARIOS),
@@ -53,7 +58,7 @@ def small(tmp_path: Path, monkeypatch):
         yield tmp_path
 
 
-def test_a_method_and_a_domain_of_ones_own_train(small: Path) -> None:
+def test_a_method_and_a_domain_of_ones_own_train(newcomer: Path) -> None:
     execute("docs/extend.md")
     scenario = rewire_jax.make_scenario("corridor/ends")
     task = scenario.tasks[2].data
@@ -64,8 +69,8 @@ def test_a_method_and_a_domain_of_ones_own_train(small: Path) -> None:
     np.testing.assert_allclose(moved.reward, -abs(0.8 - expected[0]), rtol=1e-6)
 
     settings = dataclasses.replace(tiny(scenario, "shrink"), tasks=2, seeds=1)
-    rewire_jax.train(settings, small / "run", scenario=scenario)
-    policy = rewire_jax.load_policy(small / "run", task=1)
+    rewire_jax.train(settings, newcomer / "run", scenario=scenario)
+    policy = rewire_jax.load_policy(newcomer / "run", task=1)
     assert policy(jnp.zeros(1)).shape == (1,)
     assert len(rewire_jax.make_scenario("halfcheetah/slippery").tasks) == 4
 
@@ -74,7 +79,7 @@ def test_a_method_and_a_domain_of_ones_own_train(small: Path) -> None:
 @pytest.mark.parametrize(
     "page", [page for page in pages(PYTHON) if page != "docs/extend.md"]
 )
-def test_python_blocks_run(small: Path, page: str) -> None:
+def test_python_blocks_run(newcomer: Path, page: str) -> None:
     if RUN in (ROOT / page).read_text():  # The README trains it by a command.
         settings = tiny("halfcheetah/forgetting")
         settings = dataclasses.replace(settings, tasks=2, seeds=1)
