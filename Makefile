@@ -27,13 +27,12 @@ option = $(if $(strip $(2)),--$(1) $(2))
 .DELETE_ON_ERROR:
 .PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
 	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
-	follow-readme notebooks docs clean
+	notebooks docs clean
 
 help: ## Say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' Makefile
 	@echo 'bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS TASKS' \
-		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS,' \
-		'follow-readme ONLY SKIP FOLDER KEEP.'
+		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS.'
 
 setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
 
@@ -137,12 +136,6 @@ bench-mjx: setup-mjx ## Measure steps a second of Meta-World on MJX-Warp
 readme: setup ## Make the tables of README.md and docs anew from experiments/results
 	$(RUN) -m experiments.readme
 
-follow-readme: setup ## Follow README.md in an empty folder, word for word
-	$(RUN) -m experiments.follow_readme $(strip \
-		$(call option,only,$(ONLY)) \
-		$(call option,skip,$(SKIP)) \
-		$(call option,folder,$(FOLDER)) \
-		$(if $(KEEP),--keep))
 
 notebooks: setup ## Execute the notebooks anew, in place
 	$(RUN) -m notebooks.execute

@@ -3,6 +3,7 @@
 Nothing is fetched, neither to build it nor to read it.
 """
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,17 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # for docs and experiments
 
-from docs import drawings, made, notebooks  # noqa: E402
+from docs import drawings, made  # noqa: E402
 
 project = "rewire_jax"
 author = "the authors of rewire_jax"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["drawings"]
 smartquotes = False  # They would make a dash of a flag's hyphens.
 default_role = "code"  # Docstrings quote code by single backticks.
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]
+nb_execution_mode = "off"  # Pages show the outputs that are committed.
 
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
@@ -47,10 +49,17 @@ def _fields(app: Any, what: str, name: str, each: Any, *rest: Any) -> Any:
     return ("", None) if hasattr(each, "_fields") else None
 
 
+def _prepare(app: Any) -> None:
+    """Makes the drawings, and copies the notebooks to where Sphinx looks for pages."""
+    drawings.write(ROOT / "docs/drawings")
+    (ROOT / "docs/notebooks").mkdir(exist_ok=True)
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        shutil.copy(path, ROOT / "docs/notebooks")
+
+
 def setup(app: Any) -> None:
-    """Whenever the documentation is built, what is not written by hand is made."""
-    app.connect("builder-inited", lambda app: drawings.write(ROOT / "docs/drawings"))
-    app.connect("builder-inited", lambda app: notebooks.write(ROOT / "docs/notebooks"))
+    """Registers what is done whenever the documentation is built."""
+    app.connect("builder-inited", _prepare)
     app.connect("source-read", made.fill)
     app.connect("autodoc-skip-member", _skip)
     app.connect("autodoc-process-signature", _fields)

@@ -1,4 +1,4 @@
-"""The drawings of the concepts, computed with the package's own functions."""
+"""The drawings of the page on concepts, computed with the package's functions."""
 
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,12 @@ _MODES = (
     ([1, 0, 2, 4, 3], [2, 0, 1, 3, 4]),
     ([3, 1, 4, 0, 2], [1, 4, 2, 0, 3]),
 )
-# The same drawing gives the same file.
+# Makes the files reproducible.
 _STYLE: Any = {"svg.hashsalt": "rewire_jax", "font.size": 9}
 
 
 def write(folder: Path) -> list[Path]:
-    """Draws all, as SVG; returns the files."""
+    """Writes all drawings as SVG; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for draw in (permutation, modes, alignment):
@@ -38,7 +38,7 @@ def write(folder: Path) -> list[Path]:
 
 
 def permutation() -> Figure:
-    """Neurons before and after, the hard permutation, and two relaxations of it."""
+    """Neurons before and after a permutation, its matrix, and two relaxations."""
     n, scores = len(_SCORES), jnp.asarray(_SCORES)
     order = np.asarray(rewire_jax.permute(jnp.arange(n, dtype=float), scores, 1.0), int)
     figure = Figure((9, 2.7), layout="constrained")
@@ -60,7 +60,7 @@ def permutation() -> Figure:
 
 
 def modes() -> Figure:
-    """One set of weights, wired in three ways."""
+    """One set of weights with three wirings."""
     figure = Figure((9, 3.2), layout="constrained")
     for number, (axes, orders) in enumerate(
         zip(figure.subplots(1, len(_MODES)), _MODES, strict=True), 1
@@ -84,7 +84,7 @@ def modes() -> Figure:
 
 
 def alignment() -> Figure:
-    """Weights that have moved, adapters that follow, and a cached wiring refined."""
+    """Weights before and after a task, their adapters, and a refined wiring."""
     n, random = 8, np.random.default_rng(3)
     before = [Linear(_smooth(n, phase), jnp.zeros(n)) for phase in (0.0, 1.0)]
     out, inp = random.permutation(n), random.permutation(n)
@@ -130,7 +130,7 @@ def _smooth(n: int, phase: float) -> jax.Array:
 
 
 def _moved(axes: Axes, left: float, right: float, order: Any) -> None:
-    """Neurons in one column, and in the next in another order."""
+    """Two columns of neurons in different orders, joined by lines."""
     for place, neuron in enumerate(order):
         colour = _COLOURS[neuron % len(_COLOURS)]
         axes.plot([left, right], [neuron, place], color=colour, lw=1.2, zorder=1)

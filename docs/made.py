@@ -1,4 +1,4 @@
-"""What the pages do not say by hand: `<!-- made: NAME ARGUMENT -->` stands for it."""
+"""Generated parts of the pages: each replaces a `<!-- made: NAME ARGUMENT -->`."""
 
 import contextlib
 import dataclasses
@@ -29,7 +29,7 @@ _EXAMPLE = "halfcheetah/forgetting"
 
 
 def fill(app: Any, page: str, source: list[str]) -> None:
-    """Sphinx's event `source-read`: puts in a page what is made."""
+    """Handles Sphinx's event `source-read`: fills in the generated parts of a page."""
     del app, page
     source[0] = re.sub(
         r"<!-- made: (\w+) ?(\S*) -->", lambda m: MADE[m[1]](m[2]), source[0]
@@ -43,7 +43,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 class Item(typing.NamedTuple):
-    """An argument or a setting, as its class describes it."""
+    """An argument or a setting, with the description from its class."""
 
     name: str
     kind: Any
@@ -52,7 +52,7 @@ class Item(typing.NamedTuple):
 
 
 def items(cls: type) -> Iterator[Item]:
-    """The fields of a dataclass that tyro makes arguments of."""
+    """The fields of a dataclass that tyro turns into arguments."""
     meanings: dict[str, str] = {}
     for each in reversed(cls.__mro__):
         for said in docstring_parser.parse(each.__doc__ or "").params:
@@ -66,7 +66,7 @@ def items(cls: type) -> Iterator[Item]:
 
 
 def values(kind: Any) -> str:
-    """What an argument can be, in a word or its choices."""
+    """The type of an argument in a word, or its choices."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is Annotated:
         shown = [mark.metavar for mark in inner[1:] if hasattr(mark, "metavar")]
@@ -81,7 +81,7 @@ def values(kind: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as one types it; nothing where there is none."""
+    """A value as the user types it; empty if there is none."""
     if value is None or value is dataclasses.MISSING or value == ():
         return ""
     if isinstance(value, tuple):
@@ -92,14 +92,14 @@ def shown(value: Any) -> str:
 
 
 def argument(item: Item) -> str:
-    """The flag, or the name where an argument goes by its place."""
+    """The flag, or the name of a positional argument."""
     marks = getattr(item.kind, "__metadata__", ())
     placed = tyro.conf.Positional in marks
     return f"`{item.name.upper() if placed else flag(item.name)}`"
 
 
 def arguments(cls: type, besides: type | None = None) -> str:
-    """A table of a command's arguments but the settings of a run, and of `besides`."""
+    """A table of a command's arguments, without a run's settings and `besides`."""
     told = {"settings", *getattr(besides, "__dataclass_fields__", ())}
     return table(
         ["argument", "values", "default", "meaning"],
@@ -112,7 +112,7 @@ def arguments(cls: type, besides: type | None = None) -> str:
 
 
 def prose(thing: Any) -> str:
-    """A docstring before its first section, flags as code."""
+    """A docstring up to its first section, with flags as code."""
     said = re.split(r"\n\n(?:Attributes|Raises):", inspect.getdoc(thing) or "")[0]
     return re.sub(r"(?<![`\w-])--[a-z][a-z-]*", r"`\g<0>`", said)
 
@@ -126,7 +126,7 @@ def usage(_: str) -> str:
 
 
 def commands(_: str) -> str:
-    """Each command of `rewire-jax`: its dataclass in `cli`."""
+    """Each command of `rewire-jax`, from its dataclass in `cli`."""
     parts = []
     for name, cls in COMMANDS.items():
         needs = " SCENARIO" if "settings" in cls.__annotations__ else ""
@@ -150,7 +150,7 @@ def experiments(_: str) -> str:
 
 
 def targets(_: str) -> str:
-    """The Makefile's targets, as `make help` has them."""
+    """The Makefile's targets, as `make help` lists them."""
     found = re.findall(r"^([a-z-]+):.*## (.*)", (ROOT / "Makefile").read_text(), re.M)
     return table(
         ["command", "what it does"], [[f"`make {name}`", said] for name, said in found]
@@ -204,7 +204,7 @@ def methods(_: str) -> str:
 
 
 def by_scenario(_: str) -> str:
-    """What the paper profile has otherwise on some scenarios than on others."""
+    """Settings of the paper profile that differ between scenarios."""
     known = [rewire_jax.make_scenario(name) for name in rewire_jax.list_scenarios()]
     parts = []
     for title, method, part in (
@@ -234,7 +234,7 @@ def by_scenario(_: str) -> str:
 
 
 def default(name: str) -> str:
-    """A setting's default, and the profiles' where theirs differ."""
+    """A setting's default, and the profiles' values if they differ."""
     scenario = rewire_jax.make_scenario(_EXAMPLE)
     for method in METHODS:
         presets = [
@@ -253,7 +253,7 @@ def default(name: str) -> str:
 
 
 def results(prefix: str) -> str:
-    """The committed results whose names begin so; says so if there are none."""
+    """The committed results whose names start with `prefix`, or a note."""
     parts = []
     for path in sorted((ROOT / suite.RESULTS).glob(f"{prefix}*")):
         pages = path.glob("*.md") if path.is_dir() else [path]

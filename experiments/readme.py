@@ -1,9 +1,9 @@
-"""Puts committed results into the README and the pages, between their markers.
+"""Fills committed results into the README and the pages, between their markers.
 
-`<!-- results: NAME -->` and `<!-- end -->` enclose what is made from
-`experiments/results/NAME/report.md`, or from `experiments/results/NAME.md`.
-`<!-- results: NAME | HEAD | HEAD -->` takes no more than the title and the first table,
-and of that the columns whose headings begin so.
+The text between `<!-- results: NAME -->` and `<!-- end -->` comes from
+`experiments/results/NAME/report.md` or from `experiments/results/NAME.md`.
+`<!-- results: NAME | HEAD | HEAD -->` takes only the title and the first table, with
+the columns whose headings start with these words.
 """
 
 import itertools
@@ -24,15 +24,15 @@ _FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
 
 def fill(text: str, page: Path = PAGES[0], results: Path = RESULTS) -> str:
-    """The text with every marked block made anew.
+    """The text with every marked block filled again.
 
     Args:
       text: of the page.
-      page: where it lies; links in results are made to lead from there.
+      page: its path; links in results become relative to it.
       results: folder of all results.
 
     Raises:
-      UserError: a block names results, or a column, that are not there.
+      UserError: a block names results or a column that do not exist.
     """
 
     def block(match: re.Match[str]) -> str:
@@ -57,7 +57,7 @@ def fill(text: str, page: Path = PAGES[0], results: Path = RESULTS) -> str:
 
 
 def _columns(report: str, heads: Sequence[str], name: str) -> str:
-    """The title of a report, and these columns of its first table."""
+    """The title of a report, and some columns of its first table."""
     title, *lines = report.splitlines()
     lines = list(itertools.dropwhile(lambda line: not line.startswith("|"), lines))
     table = itertools.takewhile(lambda line: line.startswith("|"), lines)

@@ -1,8 +1,7 @@
 """Executes the notebooks in place; `make notebooks` does.
 
-What is written depends on the cells and on what they compute: it has no times, no
-machine, and nothing from the standard error output, where progress is shown. So another
-execution makes a small difference.
+The saved outputs hold no times, no machine names, and nothing from standard error,
+which shows progress. So a new execution changes the files only a little.
 """
 
 import sys
@@ -27,11 +26,11 @@ _LIMIT = 600  # seconds a cell
 
 
 def execute(path: Path, folder: Path) -> NotebookNode:
-    """A notebook after all its cells were executed.
+    """Executes all cells of a notebook and returns it.
 
     Args:
-      path: of the notebook, which stays as it is.
-      folder: where it runs, and leaves what it makes.
+      path: of the notebook; the file does not change.
+      folder: working directory of the cells.
 
     Raises:
       nbclient.exceptions.CellExecutionError: a cell failed.
@@ -48,7 +47,7 @@ def execute(path: Path, folder: Path) -> NotebookNode:
 
 
 def normalised(notebook: NotebookNode) -> NotebookNode:
-    """The notebook without what differs from one execution to the next."""
+    """The notebook without the parts that differ between executions."""
     notebook.metadata = nbformat.from_dict(_METADATA)
     for place, cell in enumerate(notebook.cells):
         cell.id = f"{place:02d}"
@@ -59,7 +58,7 @@ def normalised(notebook: NotebookNode) -> NotebookNode:
 
 
 def main(paths: Sequence[str]) -> None:
-    """Executes these notebooks, or all, each in an empty folder."""
+    """Executes these notebooks, or all if none is given, each in an empty folder."""
     for path in map(Path, paths or sorted(map(str, FOLDER.glob("*.ipynb")))):
         print(path, file=sys.stderr)
         with TemporaryDirectory() as folder:

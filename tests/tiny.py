@@ -11,9 +11,13 @@ def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Se
     if isinstance(scenario, str):
         scenario = make_scenario(scenario)
     quick = rewire_jax.preset(scenario, method, "quick")
+    return small(dataclasses.replace(quick, seeds=2))
+
+
+def small(settings: Settings) -> Settings:
+    """The same with budgets of seconds."""
     return dataclasses.replace(
-        quick,
-        seeds=2,
+        settings,
         interactions=640,
         envs=16,
         updates=4,
@@ -22,7 +26,7 @@ def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Se
         selection_episodes=2,
         report_every=160,
         checkpoint_every=320,
-        sac=dataclasses.replace(quick.sac, hidden=16, batch_size=32),
+        sac=dataclasses.replace(settings.sac, hidden=16, batch_size=32),
     )
 
 

@@ -14,7 +14,7 @@ from rewire_jax.cli import arguments
 from rewire_jax.core.compilation_cache import keep_compiled
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import require
-from rewire_jax.run import interrupts, train_run
+from rewire_jax.run import interrupts
 from rewire_jax.training import population
 from rewire_jax.version import __version__
 

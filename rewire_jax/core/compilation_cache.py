@@ -10,24 +10,24 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 OFF = "off"
-# A cache that fails is as good as none.
+# A cache that fails must not stop the program.
 _FAILURES = "Error (reading|writing) persistent compilation cache entry"
 
 
 def keep_compiled(folder: str | Path | None = None) -> Path | None:
-    """Keeps what is compiled from now on, so that later processes need not.
+    """Keeps compiled programs on disk, so that later processes can load them.
 
-    Processes may share the folder, and it can be deleted at any time. What lies in it
-    is executed: it should be nobody else's to write to.
+    Processes may share the folder. You can delete it at any time. JAX executes what is
+    in it, so nobody else should be able to write to it.
 
     Args:
-      folder: where; "off" for nowhere. If None, what JAX was told (as by
-        JAX_COMPILATION_CACHE_DIR) stays as it is; if that is nothing, `rewire_jax` in
-        the user's folder for caches, XDG_CACHE_HOME or ~/.cache.
+      folder: where to keep them; "off" keeps nothing. If None, JAX's own setting (such
+        as JAX_COMPILATION_CACHE_DIR) applies. If JAX has none, the folder is
+        `rewire_jax` under XDG_CACHE_HOME or ~/.cache.
 
     Returns:
-      The folder; None if nothing is kept, which a line on standard error explains
-      where it was not asked for.
+      The folder; None if nothing is kept. If this is not what you asked for, a line on
+      standard error says why.
     """
     if folder == OFF:
         jax.config.update("jax_enable_compilation_cache", False)
@@ -42,13 +42,13 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, RuntimeError) as error:  # the latter: no home
-        print(f"what is compiled is not kept for later: {error}", file=sys.stderr)
+        print(f"cannot keep compiled programs for later: {error}", file=sys.stderr)
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Even the smallest function is read faster than compiled.
+    # To load even the smallest function is faster than to compile it.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     warnings.filterwarnings("ignore", _FAILURES)
-    # A folder that was in use before would be still.
+    # Otherwise JAX would continue to use the folder from before.
     compilation_cache.reset_cache()
     return folder
 

@@ -1,18 +1,18 @@
-"""Errors a user can mend, told in one line."""
+"""Errors that the user can fix, each in one line."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 REMEDY = (
-    "free space, make it writable or name another, and give the command again, with "
-    "--resume if it trains"
+    "free space, make it writable or choose another, then run the command again, "
+    "with --resume if it trains"
 )
-"""What to do where nothing can be written."""
+"""What the user can do if nothing can be written."""
 
 
 class UserError(Exception):
-    """Something the caller can mend; the message is one line that says how.
+    """An error that the caller can fix; the message is one line that says how.
 
     The command line prints the message without a traceback and exits with 2.
     """
@@ -20,7 +20,7 @@ class UserError(Exception):
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """What the system refuses inside is a `UserError`: of `path`, or a file in it."""
+    """Turns an `OSError` into a `UserError` that names `path` or a file in it."""
     try:
         yield
     except OSError as error:

@@ -1,14 +1,15 @@
-"""Numbers as tables and pictures show them."""
+"""Formats numbers for tables and pictures."""
 
 import numpy as np
 
 
 def number(value: float | None, scale: float | None = None) -> str:
-    """A value as tables and cells show it; more decimals where `scale` is small.
+    """A value as text; the smaller `scale`, the more decimals.
 
     Args:
         value: None and NaN are shown as a dash.
-        scale: the magnitude that decides the decimals, by default the value's own.
+        scale: the magnitude that decides the number of decimals; the value's own if
+            None.
     """
     if value is None or np.isnan(value):
         return "–"

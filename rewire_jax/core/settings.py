@@ -14,20 +14,20 @@ from rewire_jax.core.errors import UserError
 T = TypeVar("T")
 
 TimeLimit = Literal["terminal", "bootstrap"]
-"""What a time limit means to the critic: an end, or a cut to look beyond."""
+"""Whether a time limit ends the return, or the critic bootstraps beyond it."""
 CriticEntropy = Literal["sample", "batch_mean"]
-"""The entropy in a critic's target: each action's own, or the batch's mean."""
+"""The entropy in a critic's target: of each action, or the mean over the batch."""
 PolicyStates = Literal["current", "both"]
-"""States in the policy's losses: where a transition began, or where it ended, too."""
+"""States in the policy's losses: the first of each transition, or both."""
 
 
 def traced(default: int) -> Any:
-    """An integer setting that, like most floats, may differ between members."""
+    """An integer setting that may differ between members, as most floats may."""
     return dataclasses.field(default=default, metadata={"traced": True})
 
 
 def static(default: float) -> Any:
-    """A float setting that shapes the program, and so is the same for all members."""
+    """A float setting that shapes the program; it is the same for all members."""
     return dataclasses.field(default=default, metadata={"traced": False})
 
 
@@ -35,8 +35,8 @@ def static(default: float) -> Any:
 def settings(cls: type[T]) -> type[T]:
     """A frozen keyword-only dataclass that is also a pytree.
 
-    Floats and `traced` integers are leaves, so that they can be traced and
-    vmapped over; all else shapes the program and is static.
+    Floats and `traced` integers are leaves, so they can be traced and vmapped over.
+    All other fields are static, because they shape the program.
     """
     cls = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
     leaves = list(traced_fields(cls))
@@ -67,24 +67,25 @@ class SacSettings:
       lr_critic: the same for both critics.
       lr_temperature: the same for the entropy temperature.
       reward_scale: factor on rewards in the critics' targets.
-      target_multiplier: target entropy is minus this times the action size.
+      target_multiplier: the target entropy is minus this number times the action size.
       initial_temperature: entropy temperature at the start of every task.
       discount: of future rewards, per step.
-      target_rate: share of the critics that moves into their targets.
+      target_rate: share by which a target update moves the targets to the critics.
       hidden: neurons in each hidden layer.
       depth: hidden layers of the policy and of each critic.
-      batch_size: transitions in an update.
+      batch_size: transitions in one update.
       policy_delay: critic updates for each update of policy and temperature.
       target_delay: critic updates for each update of the targets.
-      time_limit: what a time limit means to the critics.
-      critic_entropy: what the critics' target takes for the next action's
-        -log π: "sample" that of each action, "batch_mean" the mean over the batch, to
-        which the authors' code comes by broadcasting.
-      policy_states: states in the losses of policy and temperature: "current" those
-        that the batch's transitions begin in, "both" the observations after them, too.
-        In the authors' code these are, after an ended episode, the next one's first.
-      noise_color: of the noise in exploring actions: 0 is white, 1 pink, 2 red
-        (Eberhard et al., ICLR 2023). Updates draw white noise.
+      time_limit: "terminal" treats a time limit as the end of the return; "bootstrap"
+        adds the value of the state there.
+      critic_entropy: the -log π of the next action in the critics' target: "sample"
+        takes that of each action, "batch_mean" the mean over the batch, as broadcasting
+        does in the authors' code.
+      policy_states: states in the losses of policy and temperature: "current" takes the
+        first state of each transition, "both" also the last. After an ended episode,
+        the last state in the authors' code is the first of the next episode.
+      noise_color: color of the exploration noise: 0 is white, 1 pink, 2 red
+        (Eberhard et al., ICLR 2023). Updates always draw white noise.
     """
 
     lr_policy: float = 3e-4
@@ -108,30 +109,30 @@ class SacSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Everything a run is made of; saved with it.
+    """All settings of a run; the run saves them.
 
     Attributes:
       scenario: name of the task sequence.
       method: name of the method.
-      profile: whose values the settings started from.
+      profile: the profile that gave the initial values.
       backend: physics backend.
-      reward: version of the rewards, where an environment has several.
+      reward: version of the rewards, if the environment has several.
       seed: seed of the first member.
-      seeds: how many members, seeded one after the other.
-      tasks: how many tasks of the sequence are run.
+      seeds: number of members; their seeds are consecutive.
+      tasks: number of tasks of the sequence to train.
       interactions: training interactions (environment steps) for each task.
       paper_interactions: the same in the paper, for comparison in reports.
       envs: parallel environments of a member.
-      updates: SAC updates at a time.
-      update_every: steps of all environments from one time to the next.
-      overlap: step environments that cannot be compiled while updates are made, by the
-        policy before these updates.
+      updates: SAC updates in one round of updates.
+      update_every: steps of all environments between two rounds of updates.
+      overlap: step the environments on the host during the updates, with the policy
+        from before these updates.
       warmup: interactions of each task before its first update.
       random_interactions: interactions of each task with uniform actions.
-      buffer: transitions kept at most.
+      buffer: maximum number of transitions in the replay buffer.
       eval_episodes: episodes for each task in an evaluation.
-      selection_episodes: episodes of each candidate when a method chooses among
-        policies by their return; counted as interactions.
+      selection_episodes: episodes of each candidate when a method chooses between
+        policies by their return; they count as interactions.
       report_every: interactions between two progress reports.
       checkpoint_every: interactions between two full checkpoints, 0 for none.
       sac: Soft Actor-Critic's settings.
@@ -186,7 +187,7 @@ _AT_LEAST: dict[str, float] = {
     "target_delay": 1,
     "noise_color": 0,
 }
-# Counters have 32 bits, as floats have; the others only keep loops from being endless.
+# Counters and floats have 32 bits. The other limits only prevent endless loops.
 _LARGEST = 2**31
 _LARGEST_FLOAT = 3.4e38
 _AT_MOST = {"seeds": 4_096, "depth": 1_000}
@@ -212,7 +213,7 @@ def flag(name: str) -> str:
 
 
 def check_kinds(group: Any) -> None:
-    """Raises `UserError` unless all of a dataclass's values are of their kinds."""
+    """Raises `UserError` if a value of a dataclass has the wrong type."""
     for name, kind in typing.get_type_hints(type(group)).items():
         value = getattr(group, name)
         told = f"not {value!r:.80}"
@@ -222,14 +223,14 @@ def check_kinds(group: Any) -> None:
             require(value in known, f"{flag(name)} must be one of {choices}, {told}")
         elif kind in _KINDS:
             base, noun = _KINDS[kind]
-            # Python counts with truth values, too.
+            # In Python a bool is an int, too.
             fits = isinstance(value, base) and isinstance(value, bool) == (kind is bool)
             require(fits, f"{flag(name)} must be {noun}, {told}")
             if kind is int:
                 most = _AT_MOST.get(name, _LARGEST - 1)
                 require(value <= most, f"{flag(name)} must be at most {most}, {told}")
             if kind is float:
-                # NaN and infinity are told of elsewhere. Large ints are no floats.
+                # `validate` reports NaN and infinity. Large ints are no floats.
                 small = not _LARGEST_FLOAT <= abs(value) < math.inf
                 require(small, f"{flag(name)} is too large for a 32-bit float: {value}")
 
@@ -237,7 +238,7 @@ def check_kinds(group: Any) -> None:
 def validate(run: Settings) -> None:
     """Raises `UserError` if a value of `run` or `run.sac` makes no sense.
 
-    Of a method's own options only the kinds are checked here.
+    Of the method's own options it checks only the types.
     """
     for group in (run, run.sac, run.options):
         check_kinds(group)
@@ -259,12 +260,13 @@ def validate(run: Settings) -> None:
         )
     require(
         run.interactions >= run.warmup + run.envs * run.update_every,
-        f"--interactions {run.interactions} leaves nothing to learn from after "
-        f"--warmup {run.warmup}: raise the one or lower the other",
+        f"--interactions {run.interactions} leaves no update after --warmup "
+        f"{run.warmup}: raise --interactions or lower --warmup",
     )
     require(
         run.buffer >= run.envs,
-        f"--buffer {run.buffer} is below one step of --envs {run.envs}",
+        f"--buffer {run.buffer} cannot hold one step of --envs {run.envs}: raise "
+        "--buffer or lower --envs",
     )
 
 
@@ -292,7 +294,7 @@ def from_json(data: dict[str, Any], options: type) -> Settings:
 
 
 def _filled(cls: type[T], data: dict[str, Any]) -> T:
-    """A settings class with saved values, and the defaults of what came later."""
+    """A settings class with the saved values; newer fields get their defaults."""
     fields = {field.name: field.default for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     unknown = ", ".join(sorted(data.keys() - fields.keys()))
     require(not unknown, f"it has the unknown setting {unknown}")

@@ -1,4 +1,4 @@
-"""What an update learns from."""
+"""The transitions that an update learns from."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""What every environment of this project looks like: pure functions over pytrees."""
+"""The interface of every environment: pure functions over pytrees."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ from rewire_jax.envs.geom_trajectory import Film
 
 
 class Task(NamedTuple):
-    """What turns a domain into one task, as data, so that no task compiles anew.
+    """One task of a domain, as data, so a new task needs no new compilation.
 
     Attributes:
       physics: pytree that the environment's functions take (brax: its `System`).
-      action_scale: `[actions]`, multiplies every action before it acts and is
-        charged for: 0 masks it, -1 inverts it.
+      action_scale: `[actions]`, multiplies every action before the environment and its
+        control cost see it: 0 masks it, -1 inverts it.
       observation_mask: `[observations]`, multiplies every observation: 0 hides it.
     """
 
@@ -30,10 +30,10 @@ class State(NamedTuple):
     Attributes:
       inner: pytree of the simulator's own state.
       observation: `[observations]`, masked.
-      reward: `[]`, of the step that led here, 0 after a reset.
-      terminal: `[]` bool, the task itself ended here (never a time limit).
-      success: `[]` bool, whether the task counts as solved at this step; `()` in
-        environments that know no success.
+      reward: `[]`, of the step that led to this state; 0 after a reset.
+      terminal: `[]` bool, whether the task itself ended here; never a time limit.
+      success: `[]` bool, whether the task counts as solved at this step; `()` if the
+        environment does not define success.
     """
 
     inner: Any
@@ -52,11 +52,11 @@ class Environment(NamedTuple):
       observation_size: length of an observation.
       action_size: length of an action.
       episode_length: steps after which an episode is cut off.
-      success: whether states tell of success.
-      varied: whether every episode in training starts from a reset of its own. Such
-        an environment must not end an episode itself.
-      film: `(task, inners) -> Film`, given `State.inner` of each frame; None where
-        there is nothing to see.
+      success: whether states report success.
+      varied: whether every episode in training starts from a new reset. Such an
+        environment must not end an episode itself.
+      film: `(task, inners) -> Film`, from `State.inner` of each frame; None if there is
+        nothing to render.
     """
 
     reset: Callable[[Task, jax.Array], State]
@@ -70,23 +70,23 @@ class Environment(NamedTuple):
 
 
 class HostEnvironment(NamedTuple):
-    """An environment that cannot be compiled, and so is stepped on the host.
+    """An environment that cannot be compiled; the host steps it.
 
-    Every episode starts from a reset of its own. Steps must be determined by the seed
-    and the actions since, whatever was played before: that is how an episode is taken
-    up again where a checkpoint was made.
+    Every episode starts from a new reset. The seed and the actions of an episode must
+    determine every step of it, whatever came before. A resumed run replays them to get
+    back to its checkpoint.
 
     Attributes:
       make: `() -> gymnasium.Env`; it is pickled, and called in the process that steps
         the environment. `reset(seed=..., options={"task": index})` begins an episode
-        of the task whose `Task.physics` is `index`; `step` takes float32 actions in
-        [-1, 1] and tells success, if at all, as `info["success"]`. Observations are
-        float32. It does not truncate. If it has a `simulation`, that is what can be
-        seen of its episode: `model`, `data` and `dt` as of gymnasium's `MujocoEnv`.
+        of the task whose `Task.physics` is `index`. `step` takes float32 actions in
+        [-1, 1]; it may report success as `info["success"]`. Observations are float32.
+        It does not truncate. If it has a `simulation`, its episodes can be rendered:
+        an object with `model`, `data` and `dt`, as of gymnasium's `MujocoEnv`.
       observation_size: length of an observation.
       action_size: length of an action.
       episode_length: steps after which an episode is cut off.
-      success: whether steps tell of success.
+      success: whether steps report success.
     """
 
     make: Callable[[], Any]
@@ -98,7 +98,7 @@ class HostEnvironment(NamedTuple):
 
 @dataclass(frozen=True)
 class TaskChange:
-    """How a task differs from its unchanged domain, in names rather than indices.
+    """How a task differs from its domain, by names instead of indices.
 
     Attributes:
       name: the task's name.
@@ -107,9 +107,9 @@ class TaskChange:
       bodies: body name -> factor on its mass and collision radius.
       actions: joint name -> factor on its action (0 masks, -1 inverts);
         the name `"*"` stands for all joints.
-      hidden: share of the observation entries that is masked to 0, a fixed
+      hidden: share of the observation entries that are masked to 0, by a fixed
         random choice.
-      extra: values that only the domain itself understands.
+      extra: values with a meaning in this domain only.
     """
 
     name: str
@@ -122,7 +122,7 @@ class TaskChange:
 
 
 class Domain(NamedTuple):
-    """An environment and the way to make its tasks.
+    """An environment, and a function that makes its tasks.
 
     Attributes:
       environment: shared by all tasks of the domain.

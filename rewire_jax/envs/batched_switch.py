@@ -1,4 +1,4 @@
-"""One of several functions, chosen by an index that a batch shares."""
+"""Calls one of several functions, by an index that the whole batch shares."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -8,18 +8,19 @@ import jax.numpy as jnp
 
 
 def switch(functions: Sequence[Callable[..., Any]]) -> Callable[..., Any]:
-    """Chooses one of several functions of a batch, for an element that is vmapped.
+    """Makes a function of one element that calls one of several functions of a batch.
 
-    However deep the vmaps are nested, the chosen function runs once, on all elements
-    together, and the others do not run. Where the index itself is vmapped its values
-    take turns; `jax.lax.switch` would run every function on every element.
+    The result may be vmapped, also several times. The chosen function then runs once,
+    on all elements together, and the other functions do not run. If the index is
+    vmapped too, the elements run one after the other; `jax.lax.switch` would run every
+    function on every element.
 
     Args:
-      functions: every leaf of their arguments and results has one leading axis.
+      functions: every leaf of their arguments and results has a leading batch axis.
 
     Returns:
-      `(index, *arguments) -> result`: the index is `[]` int32, the rest are as in the
-      functions but without that axis.
+      `(index, *arguments) -> result`. The index is `[]` int32. Arguments and result are
+      those of the functions, without the batch axis.
     """
 
     @jax.custom_batching.custom_vmap

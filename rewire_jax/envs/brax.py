@@ -1,8 +1,8 @@
 """Brax's HalfCheetah, Ant and Humanoid as domains whose tasks are data.
 
-A task's physics is a whole brax `System`. All of one domain's systems share
-their structure and static fields, so one trace serves them all, and they can be
-stacked and vmapped.
+The physics of a task is a whole brax `System`. All systems of a domain have the same
+structure and static fields. So one trace serves them all, and they can be stacked and
+vmapped.
 """
 
 import copy
@@ -29,10 +29,10 @@ NAMES = ("halfcheetah", "ant", "humanoid")
 BACKENDS = ("positional", "spring", "generalized", "mjx")
 EPISODE_LENGTH = 1000
 
-# Which geoms of a body its factor resizes. Brax v1 resized a body's first
-# collider on HalfCheetah and its last on Humanoid (a shin's last is the foot).
-# An Ant leg had one collider in v1; here it is a capsule with a foot, and only
-# the foot touches the ground.
+# The geoms of a body that its factor resizes. Brax v1 resized the first collider of a
+# body on HalfCheetah and the last on Humanoid (the last of a shin is the foot). An Ant
+# leg had one collider in v1. Here it is a capsule with a foot, and only the foot
+# touches the ground.
 _RESIZED = {
     "halfcheetah": slice(0, 1),
     "ant": slice(None),
@@ -114,7 +114,7 @@ def _make_environment(env: PipelineEnv) -> Environment:
         )
 
     observation = jax.eval_shape(lambda key: env.reset(key).obs, jax.random.key(0))
-    # Tracing these takes seconds: done once for all functions that call them.
+    # Tracing takes seconds. With jit, all functions that call these share one trace.
     return Environment(
         reset=jax.jit(reset),
         step=jax.jit(step),
@@ -126,7 +126,7 @@ def _make_environment(env: PipelineEnv) -> Environment:
 
 
 def _film(seconds: float, task: Task, inners: Sequence[Any]) -> Film:
-    """What is seen of pipeline states; the geometries have the task's sizes."""
+    """A film of pipeline states; the geometries have the sizes of the task."""
     system = task.physics
     model = copy.copy(system.mj_model)
     model.geom_size[:] = system.geom_size
@@ -144,14 +144,14 @@ def _film(seconds: float, task: Task, inners: Sequence[Any]) -> Film:
 
 
 def _normalize(system: System, backend: str) -> System:
-    """Makes every leaf an array on the host and the masses those that act."""
+    """Makes every leaf an array on the host, and every mass the one that acts."""
     changed: dict[str, Any] = {"tex_data": np.zeros(0, np.uint8)}  # half a megabyte
     if backend in ("positional", "spring"):
-        # These two raise each mass to 1 - spring_mass_scale (Ant: to 0) before
-        # they use it, which would shrink a body factor or undo it.
+        # These backends first raise each mass to the power 1 - spring_mass_scale (0 on
+        # Ant). That would weaken a body factor or undo it.
         mass = system.link.inertia.mass ** (1 - system.spring_mass_scale)
         changed |= {"link.inertia.mass": mass, "spring_mass_scale": 0.0}
-    # On a device the changes below would be compiled, one by one.
+    # On a device, each of the changes below would be compiled.
     return jax.tree.map(
         lambda leaf: np.asarray(leaf, jnp.result_type(leaf)),
         system.tree_replace(changed),
@@ -188,7 +188,7 @@ def _change_system(
     for name, factor in change.bodies.items():
         mass[bodies[name]] = factor
         radius[np.flatnonzero(model.geom_bodyid == bodies[name])[resized]] = factor
-    # MuJoCo derives the softness of contacts and limits from the masses; let it.
+    # MuJoCo derives the softness of contacts and limits from the masses.
     model.body_mass[:] *= mass
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
@@ -198,11 +198,11 @@ def _change_system(
     new = {
         "gravity": system.gravity * change.gravity,
         "opt.gravity": system.opt.gravity * change.gravity,
-        # All three columns, as v1 had one number. Of two geoms that touch the
-        # rougher one counts, so all of them change, the floor too.
+        # All three columns, because v1 had one number. If two geoms touch, the rougher
+        # one counts; so the friction of all geoms changes, the floor's too.
         "geom_friction": system.geom_friction * change.friction,
-        # The radius only: a capsule keeps the distance between its ends. The
-        # bound of a capsule or a sphere grows as its radius does.
+        # Only the radius changes; a capsule keeps the distance between its ends. The
+        # bound of a capsule or a sphere grows with its radius.
         "geom_size": size * scale,
         "geom_rbound": system.geom_rbound + size[:, 0] * (radius - 1),
         "link.inertia.mass": system.link.inertia.mass * mass[1:],
@@ -214,7 +214,7 @@ def _change_system(
         "dof.invweight": model.dof_invweight0,
         "stat.meaninertia": model.stat.meaninertia,
     }
-    # A new array for each: MuJoCo's are views of a model that dies here.
+    # Copies, because MuJoCo's arrays are views of a model that is freed here.
     changed = system.tree_replace({k: np.array(v) for k, v in new.items()})
     return jax.tree.map(
         lambda x, old: jnp.asarray(x.astype(old.dtype)), changed, system

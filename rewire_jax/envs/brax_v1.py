@@ -1,8 +1,8 @@
 """Brax's HalfCheetah, Ant and Humanoid on `brax.v1`, the engine of the paper's runs.
 
-A task change acts on the domain's config, as in the authors' code, and a `System` is
-made of that. The task's physics is what differs between systems; the rest is shared,
-so one trace serves all tasks of a domain.
+A task change alters the domain's config, as in the authors' code; the config makes a
+`System`. The physics of a task holds only what differs between systems. So one trace
+serves all tasks of a domain.
 """
 
 import copy
@@ -32,12 +32,12 @@ _DOMAINS = {
 
 
 class Physics(NamedTuple):
-    """What of a `brax.v1` system a task can change.
+    """The parts of a `brax.v1` system that a task can change.
 
     Attributes:
       leaves: the system's arrays that gravity, friction, masses or radii change.
-      radius: `[colliders]` in metres, of all bodies in turn; 0 of a plane. By it a
-        reset puts the bodies on the ground.
+      radius: `[colliders]` in metres, body by body; 0 for a plane. A reset uses it to
+        put the bodies on the ground.
     """
 
     leaves: tuple[jax.Array, ...]
@@ -52,8 +52,8 @@ def make_domain(name: str) -> Domain:
       name: `"halfcheetah"`, `"ant"` or `"humanoid"`.
 
     Returns:
-      The domain. Bodies have the names that they have on the other backends. Joints
-      have v1's: one name stands for all actions of a joint of several axes.
+      The domain. Bodies have the same names as on the other backends. Joints have v1's
+      names: if a joint has several axes, one name stands for all its actions.
 
     Raises:
       UserError: the installed brax has no `brax.v1`.
@@ -68,9 +68,9 @@ def make_domain(name: str) -> Domain:
 
 
 class Systems:
-    """All systems of a domain: what they share, and what a task change makes of them.
+    """All systems of a domain: the parts they share, and the parts that tasks change.
 
-    An array that no change reaches stays a constant of the compiled program.
+    An array that no task changes is a constant of the compiled program.
 
     Attributes:
       env: the environment of `brax.v1`.
@@ -110,7 +110,7 @@ class Systems:
         return self._make(post_process_fn=alter).sys
 
     def physics(self, change: TaskChange) -> Physics:
-        """What is the changed system's own."""
+        """The parts of the changed system that differ from others."""
         system = self._changed(change)
         leaves = jax.tree.leaves(_whole(system))
         radius = [
@@ -142,7 +142,7 @@ class Systems:
 
 
 def _whole(system: Any) -> tuple[Any, Any]:
-    """A system, and what tasks change of its colliders, which is no leaf of it."""
+    """A system, and what tasks change of its colliders, which are no leaves."""
     return system, [(c.cull, c.velocity_threshold) for c in system.colliders]
 
 
@@ -178,7 +178,7 @@ def _make_environment(systems: Systems) -> Environment:
 
     make_state = brax_v1_shim.module("envs.env").State
     sizes = jax.eval_shape(env.reset, jax.random.key(0))
-    # Tracing these takes seconds: done once for all functions that call them.
+    # Tracing takes seconds. With jit, all functions that call these share one trace.
     return Environment(
         reset=jax.jit(reset),
         step=jax.jit(step),
@@ -214,7 +214,7 @@ def _joint_of_each_action(config: Any) -> list[str]:
 
 
 def _film(config: Any, task: Task, inners: Sequence[Any]) -> Film:
-    """What is seen of the bodies `QP`; the colliders have the task's sizes."""
+    """A film of the bodies' `QP`; the colliders have the sizes of the task."""
     model = _model(config, np.asarray(task.physics.radius, float))
     owner, offset, turn = [], [], []
     for index, body in enumerate(config.bodies):
@@ -225,7 +225,7 @@ def _film(config: Any, task: Task, inners: Sequence[Any]) -> Film:
             turn.append([angles.x, angles.y, angles.z])
     bodies = jax.tree.map(lambda *leaves: np.stack(leaves), *inners)
     position, rotation = [], []
-    # v1's Euler angles turn about the axes that have been turned, x first.
+    # v1's Euler angles are intrinsic, x first.
     own = Rotation.from_euler("XYZ", turn, degrees=True)
     for place, quaternion in zip(bodies.pos, bodies.rot, strict=True):
         whole = Rotation.from_quat(quaternion[owner], scalar_first=True)
@@ -235,7 +235,7 @@ def _film(config: Any, task: Task, inners: Sequence[Any]) -> Film:
 
 
 def _model(config: Any, radii: Any) -> mujoco.MjModel:
-    """A MuJoCo model of the colliders in their order, to be looked at."""
+    """A MuJoCo model of the colliders in their order, for rendering only."""
     spec, kinds, radius = mujoco.MjSpec(), mujoco.mjtGeom, iter(radii)
     spec.add_texture(
         name="floor",
@@ -251,14 +251,14 @@ def _model(config: Any, radii: Any) -> mujoco.MjModel:
     spec.worldbody.add_light(pos=[0, 0, 4], dir=[0, 0, -1])
     for body in config.bodies:
         for collider in body.colliders:
-            # A body for each keeps their order: the world's own geometries come first.
+            # One body for each keeps the order: geometries of the world come first.
             of = spec.worldbody.add_body()
             r, half = next(radius), collider.capsule.length / 2
             if collider.HasField("plane"):
                 of.add_geom(type=kinds.mjGEOM_PLANE, size=[40, 40, 1], material="floor")
                 continue
             of.add_freejoint()
-            # A capsule's length includes its round ends; a ball has nothing between.
+            # The length of a capsule includes its round ends; in a ball they meet.
             ball = half <= r
             of.add_geom(
                 type=kinds.mjGEOM_SPHERE if ball else kinds.mjGEOM_CAPSULE,

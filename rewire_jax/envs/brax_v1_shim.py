@@ -1,7 +1,7 @@
 """Imports `brax.v1`, the engine of the paper's runs, on a current JAX.
 
-brax 0.12.3 is the last release that has it. This file can go when `brax.v1` goes, or
-when a maintained copy of it runs without help.
+brax 0.12.3 is the last release that has it. Delete this file when `brax.v1` is no
+longer used, or when a maintained copy of it runs on a current JAX.
 """
 
 import contextlib
@@ -25,8 +25,8 @@ def module(name: str) -> ModuleType:
     Raises:
       UserError: the installed brax has no `brax.v1`.
     """
-    # brax.v1 says that it is deprecated, and gym, which it imports, that it is not
-    # maintained.
+    # brax.v1 warns that it is deprecated. It imports gym, which warns that it is
+    # unmaintained.
     with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
         warnings.simplefilter("ignore")
         _restore_names()
@@ -37,13 +37,13 @@ def module(name: str) -> ModuleType:
                 raise
             version = importlib.metadata.version("brax")
             raise UserError(
-                f"--backend v1 needs brax {NEEDED}, and this is {version}: "
-                f"pip install 'brax=={NEEDED}', or take --backend positional"
+                f"--backend v1 needs brax {NEEDED}, but {version} is installed: "
+                f"pip install 'brax=={NEEDED}', or use --backend positional"
             ) from error
 
 
 def _restore_names() -> None:
-    """Gives JAX back two names by which `brax.v1.jumpy` tells NumPy from JAX."""
+    """Restores two names of JAX. `brax.v1.jumpy` needs them to tell NumPy from JAX."""
     if not hasattr(jax.interpreters.batching, "BatchTracer"):  # gone since jax 0.10
         setattr(jax.interpreters.batching, "BatchTracer", jax.core.Tracer)  # noqa: B010
     asked = "unsafe_am_i_under_a_jit_DO_NOT_USE"

@@ -15,8 +15,8 @@ class DomainKind(NamedTuple):
     Attributes:
       make: `(name, changes, backend, reward) -> Domain`; the changes are those of a
         scenario's tasks.
-      backend: that it is made for where none is named; "probe" and "own" are the only
-        one of theirs.
+      backend: the default backend; "probe" and "own" mark domains that have one
+        backend only.
     """
 
     make: Callable[[str, Sequence[TaskChange], str, str], Domain]
@@ -63,7 +63,7 @@ DOMAINS: dict[str, DomainKind] = {
 
 
 def register_domain(name: str, domain: Domain) -> None:
-    """Adds a domain of one's own, for specs to name; one of that name gives way."""
+    """Registers a domain for specs to name; it replaces one of the same name."""
     DOMAINS[name] = DomainKind(lambda *_: domain, "own")
 
 

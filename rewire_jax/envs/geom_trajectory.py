@@ -1,4 +1,4 @@
-"""An episode as it is seen: the geometries of a MuJoCo model, moving."""
+"""The motion of an episode, to be rendered: geometries of a MuJoCo model."""
 
 from typing import Any, NamedTuple
 
@@ -7,16 +7,16 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-_HIDDEN = 3  # MuJoCo shows the groups of geometries before this one.
-_PLANE = 0  # mujoco.mjtGeom.mjGEOM_PLANE, without its import
+_HIDDEN = 3  # MuJoCo shows the geometry groups below this number.
+_PLANE = 0  # mujoco.mjtGeom.mjGEOM_PLANE, without importing mujoco
 
 
 class Film(NamedTuple):
-    """What is seen of an episode, frame by frame.
+    """The poses of all geometries in an episode, frame by frame.
 
     Attributes:
-      model: `mujoco.MjModel`; shapes and colours are read from it, poses are not.
-      seconds: from one frame to the next.
+      model: `mujoco.MjModel`; it gives shapes and colours, not poses.
+      seconds: time between two frames.
       position: `[frames, geoms, 3]` in metres.
       rotation: `[frames, geoms, 3, 3]`, from a geometry's own axes to the world's.
     """
@@ -28,14 +28,14 @@ class Film(NamedTuple):
 
 
 def solids(film: Film) -> Array:
-    """Indices of the geometries that are shown and have an end, so no floors."""
+    """Indices of the visible geometries, except planes such as the floor."""
     model = film.model
     shown = (model.geom_group < _HIDDEN) & (model.geom_rgba[:, 3] > 0)
     return np.flatnonzero(shown & (model.geom_type != _PLANE))
 
 
 def movable(film: Film) -> Array:
-    """Those of the solids that belong to bodies with joints."""
+    """Indices of the solids that belong to bodies with joints."""
     model, some = film.model, solids(film)
     return some[model.body_weldid[model.geom_bodyid[some]] > 0]
 
@@ -49,9 +49,9 @@ def colour(film: Film, geom: int) -> Array:
 
 
 def gaze(film: Film) -> tuple[Array, float]:
-    """Where a camera looks, `[frames, 3]`, and how large is what it must show.
+    """The point that a camera looks at, `[frames, 3]`, and the size of what it shows.
 
-    It follows what walks away, in the plane, and rests on what stays.
+    The point follows a body that walks away, in the plane. Otherwise it does not move.
     """
     moving = movable(film)
     some = moving if len(moving) else solids(film)

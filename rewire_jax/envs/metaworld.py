@@ -1,8 +1,8 @@
 """Meta-World's manipulation tasks (v3) as a domain whose tasks are data.
 
-The observation has 39 numbers: hand (3), gripper (1), objects (14), the same 18 of the
-step before, and the goal (3). The action has four, in [-1, 1]: three move the hand by
-at most a centimetre each, one drives the gripper.
+The observation has 39 numbers: hand (3), gripper (1), objects (14), the same 18 numbers
+of the previous step, and the goal (3). The action has four numbers in [-1, 1]. Three
+move the hand by at most a centimetre each; one drives the gripper.
 """
 
 import functools
@@ -27,7 +27,7 @@ def make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
 
     A `TaskChange` names its task as `extra={"task": name}`. It may change actions by
     joint name (`"x"`, `"y"`, `"z"`, `"gripper"`) and hide observations, nothing else.
-    `Task.physics` is the task's place in `names`.
+    `Task.physics` is the index of the task in `names`.
 
     Args:
       backend: `"mujoco"`, the package `metaworld` on the host, or `"mjx"`, compiled.
@@ -47,7 +47,7 @@ def make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
 
 @functools.cache
 def _make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
-    # Each backend needs packages of its own, so only the one asked for is imported.
+    # Each backend needs other packages, so this imports only the requested one.
     module = importlib.import_module(f"rewire_jax.envs.metaworld_{backend}")
     environment = module.make_environment(reward, names)
     return Domain(environment, functools.partial(_make_task, names))

@@ -1,8 +1,8 @@
 """Meta-World compiled: the package `MTCWorldMJX`, on MuJoCo's Warp for JAX.
 
-Each task has a MuJoCo model of its own, so their states differ in size. Here all lie in
-vectors of one length: a task is data, and one program serves them all, of which only
-the branch of the current task runs.
+Each task has its own MuJoCo model, so the states of the tasks differ in size. Here all
+states are vectors of one length. So a task is data, and one program serves all tasks.
+It runs only the branch of the current task.
 """
 
 import copy
@@ -23,7 +23,7 @@ from rewire_jax.envs.metaworld import EPISODE_LENGTH, JOINTS, OBSERVATION_SIZE
 try:
     import warp
 
-    warp.config.quiet = True  # set before anything is compiled, which it tells of
+    warp.config.quiet = True  # before it compiles and prints messages
     import MTCWorldMJX
     from MTCWorldMJX import mjx_env
     from MTCWorldMJX.envs.sawyer_xyz import SawyerXYZConfig
@@ -37,9 +37,9 @@ except ImportError as error:
 _VERSION = "-v3"
 NAMES = tuple(name.removesuffix(_VERSION) for name in MTCWorldMJX.ENV_CLS_MAP)
 
-# What of MuJoCo's model and data differs between environments and between steps; the
-# rest is constant, or computed before it is read. Warp places geometry that is fixed to
-# the world once only, so poses are kept too.
+# Fields of MuJoCo's model that differ between environments, and of its data that differ
+# between steps. All others are constant, or computed before they are read. Warp places
+# geometry that is fixed to the world only once, so poses are kept too.
 _PLACED = ("body_pos", "site_pos")
 _MOVING = (
     "qpos",
@@ -51,21 +51,21 @@ _MOVING = (
     "geom_xmat",
 )
 
-# Room in each environment. Scripted experts and random actions on the ten tasks of
-# Continual World made at most 42 contacts and 176 constraints.
+# Capacity of each environment. Scripted experts and random actions on the ten tasks of
+# Continual World needed at most 42 contacts and 176 constraints.
 _CONTACTS = 96
 _CONSTRAINTS = 384
-# The models' own; the package's six iterations are for speed.
+# As in the models. The package uses six, for speed.
 _ITERATIONS = 50
 
 
 class Scene(NamedTuple):
-    """What of a simulation is kept between steps.
+    """The part of a simulation that is kept between steps.
 
     Attributes:
       model: field of MuJoCo's model -> its value.
       data: field of MuJoCo's data -> its value.
-      info: what the reward and the observation remember.
+      info: values that the reward and the observation need from earlier steps.
     """
 
     model: dict[str, jax.Array]
@@ -77,7 +77,7 @@ _Moved = tuple[Scene, jax.Array, jax.Array, jax.Array]
 
 
 class Simulator(NamedTuple):
-    """One task's simulation, in a batch of environments that share their memory.
+    """The simulation of one task, for a batch of environments.
 
     Attributes:
       reset: `keys [n] -> Scene, observations [n, 39], rewards [n], successes [n]`.
@@ -91,7 +91,7 @@ class Simulator(NamedTuple):
 
 
 def make_environment(reward: str, names: tuple[str, ...]) -> Environment:
-    """The environment of some tasks; goal and start are drawn anew at every reset.
+    """The environment of some tasks. Every reset draws a new goal and a new start.
 
     Args:
       reward: `"v2"`; the package has no other.
@@ -164,7 +164,7 @@ def make_environment(reward: str, names: tuple[str, ...]) -> Environment:
 
 @functools.cache
 def make_simulator(name: str) -> Simulator:
-    """One task's simulation; the same name gives the identical object.
+    """The simulation of one task; the same name gives the identical object.
 
     Args:
       name: of `NAMES`.

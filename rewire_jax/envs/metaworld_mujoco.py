@@ -49,8 +49,8 @@ def make_environment(reward: str, names: tuple[str, ...]) -> HostEnvironment:
 class Simulator(gymnasium.Env):
     """Episodes of several tasks, each determined by its seed and its actions.
 
-    Goal and start are drawn anew at every reset. Episodes have no end, but the package
-    takes at most 500 steps. A task's model is built at its first episode, and kept.
+    Every reset draws a new goal and a new start. Episodes do not end, but the package
+    allows at most 500 steps. A task's model is built at its first episode and kept.
     """
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,))
@@ -72,8 +72,8 @@ class Simulator(gymnasium.Env):
         """Begins an episode.
 
         Args:
-          seed: what start and goal are drawn from.
-          options: `{"task": index}`, into the names.
+          seed: determines start and goal.
+          options: `{"task": index}`, an index into the names.
 
         Returns:
           `[39]` float32, the observation, and an empty dictionary.
@@ -84,8 +84,8 @@ class Simulator(gymnasium.Env):
         if task not in self._simulations:
             self._simulations[task] = _simulation(self._names[task], self._reward)
         self._current = self._simulations[task]
-        # The package's reset lays the task out twice, the second time from MuJoCo's
-        # own reset: once seeded, nothing that acts is left of what was played before.
+        # The package's reset sets the task up twice, the second time after MuJoCo's own
+        # reset. So after seeding, nothing of the previous episode has an effect.
         self._current.seed(int(seed))
         observation, _ = self._current.reset()
         return observation.astype(np.float32), {}
@@ -99,9 +99,8 @@ class Simulator(gymnasium.Env):
           action: `[4]` in [-1, 1].
 
         Returns:
-          `[39]` float32, the observation; the reward; whether the task itself ended
-          and whether time did, both never; whether the task is solved, as
-          `{"success": bool}`.
+          `[39]` float32, the observation; the reward; terminated and truncated, both
+          always False; and `{"success": bool}`, whether the task is solved.
         """
         observation, reward, _, _, info = self._current.step(action)
         success = {"success": bool(info["success"])}
@@ -109,13 +108,13 @@ class Simulator(gymnasium.Env):
 
 
 def _simulation(name: str, reward: str) -> SawyerXYZEnv:
-    """One of the package's environments, which draws start and goal from its seed."""
+    """An environment of the package that draws start and goal from its seed."""
     env = ALL_V3_ENVIRONMENTS[name + _VERSION](reward_function_version=reward)
     env._set_task_called = True
     env._freeze_rand_vec = False
     env.seeded_rand_vec = True
-    # The goal is seen. Observations are clipped to a space that bounds a hidden goal
-    # to zeros, and is cached.
+    # The goal is observed. The package clips observations to a cached space, which
+    # would clip the goal to zeros.
     env._partially_observable = False
     del env.sawyer_observation_space
     return env

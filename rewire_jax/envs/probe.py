@@ -49,10 +49,10 @@ def make_domain(name: str) -> Domain:
     - `action`: one step, reward -(action - 0.5)². Best action 0.5, value 0.
     - `match`: one step, observation in [-0.5, 0.5], reward
       -(action - observation)². Best action the observation, value 0.
-    - `endless`: reward 1 on every step, cut off after 4. Value 1 / (1 - γ) where
-      the cut is bootstrapped through, 1 / (1 - 3γ/4) where it is taken for an
-      end (the observation does not tell the step, so this is the fixed point
-      over steps that are all as frequent).
+    - `endless`: reward 1 on every step, cut off after 4. Value 1 / (1 - γ) if the
+      critic bootstraps beyond the cut, 1 / (1 - 3γ/4) if it treats the cut as an
+      end. (The observation does not show the step, so the second value is the
+      fixed point over four equally frequent steps.)
 
     Args:
       name: one of the above.

@@ -14,17 +14,17 @@ class ScenarioSpec:
     """A scenario before anything is built.
 
     Attributes:
-      name: what it is called, `"domain/kind"` by custom.
+      name: its name, by convention `"domain/kind"`.
       domain: `"halfcheetah"`, `"ant"`, `"humanoid"`, `"metaworld"` or a probe's name.
-      changes: the tasks in order; equal changes are the same task, met again.
-      repeats: how often the whole list is gone through.
+      changes: the tasks in order; equal changes are the same task, which recurs.
+      repeats: how often the whole list is repeated.
       interactions: environment steps of training for each task.
       preset: name of the scenario whose settings `preset` gives this one, such as
         "halfcheetah/forgetting"; its own by default, which for a scenario of one's
         own means the defaults.
 
     Raises:
-      UserError: a value that no scenario can have.
+      UserError: a value is invalid.
     """
 
     name: str
@@ -61,8 +61,8 @@ class ScenarioTask:
 
     Attributes:
       name: the task's name.
-      distinct: which of the scenario's distinct tasks it is, counted from 0.
-      data: what the environment takes; the same object wherever the task recurs.
+      distinct: index among the scenario's distinct tasks, from 0.
+      data: the environment's input; if the task recurs, the same object.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Scenario:
       domain: name of its domain.
       backend: physics backend, `"probe"` for a probe.
       reward: version of the rewards, where the domain has several.
-      environment: shared by all tasks; identical for one domain and backend.
+      environment: of all tasks; the same object for each domain and backend.
       tasks: the whole sequence, repeats included.
       distinct: number of distinct tasks.
       interactions: environment steps of training for each task.
@@ -114,8 +114,8 @@ def make_scenario(
 
     Args:
       spec: a spec, or the name of a known one.
-      backend: physics backend, the domain's first if None; probes and
-        domains of one's own ignore it.
+      backend: physics backend, the domain's first if None; probes and registered
+        domains ignore it.
       reward: version of Meta-World's rewards, `"v1"` or `"v2"`; others ignore it.
 
     Returns:
@@ -153,10 +153,10 @@ def make_scenario(
 
 
 def register_scenario(spec: ScenarioSpec) -> None:
-    """Makes `spec` known by its name; the same spec may come again.
+    """Registers `spec` by its name. Registering the same spec again is allowed.
 
     Raises:
-      UserError: another scenario has that name.
+      UserError: another scenario has this name.
     """
     if SCENARIOS.get(spec.name, spec) != spec:
         raise UserError(f"There is another scenario named {spec.name!r}.")
@@ -224,7 +224,7 @@ _HUMANOID = {
     )
 }
 
-# Goals in opposite corners follow each other: what serves one harms the next.
+# Consecutive goals are in opposite corners, so they conflict.
 _REACH = {
     name: TaskChange(name, extra={"goal": goal})
     for name, goal in (
@@ -297,7 +297,7 @@ for _name, _tasks in (
     ),
 ):
     register_scenario(_continual_world_spec(_name, _tasks))
-# Each task alone: what transfer to it is measured against.
+# Each task alone, as the reference for forward transfer.
 for _change in SCENARIOS["continual_world/cw10"].changes:
     register_scenario(_continual_world_spec(_change.name, _change.name))
 register_scenario(

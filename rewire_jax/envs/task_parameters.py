@@ -1,4 +1,4 @@
-"""The parts of a `TaskChange` that mean the same in several domains."""
+"""Parts of a `TaskChange` that have the same meaning in several domains."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -14,12 +14,12 @@ ALL_JOINTS = "*"
 
 
 def action_scale(joints: Sequence[str], factors: Mapping[str, float]) -> jax.Array:
-    """Factors by joint name, put into the environment's own action order.
+    """Factors by joint name, in the order of the environment's actions.
 
     Args:
       joints: the joint that each action drives, in action order.
-      factors: joint name -> factor; `"*"` is every joint; a joint that both
-        name gets the product.
+      factors: joint name -> factor; `"*"` applies to every joint. A joint named
+        beside `"*"` gets the product of both.
 
     Returns:
       `[actions]` float32.
@@ -34,10 +34,10 @@ def action_scale(joints: Sequence[str], factors: Mapping[str, float]) -> jax.Arr
 
 
 def observation_mask(size: int, hidden: float) -> jax.Array:
-    """Masks the share `hidden` of an observation, rounded down, by a fixed draw.
+    """Masks the share `hidden` of an observation, rounded down.
 
-    The draw is numpy's legacy `permutation` at seed 0 of the zeros followed by
-    the ones, as the paper's tasks were drawn.
+    The choice is fixed, and the same as for the paper's tasks: numpy's legacy
+    `permutation` with seed 0 of the zeros followed by the ones.
 
     Args:
       size: length of the observation.
@@ -85,7 +85,7 @@ def physical_domain(
 
 
 def check_physics(change: TaskChange, bodies: Sequence[str]) -> None:
-    """Raises `UserError` unless a domain with these bodies can be changed so."""
+    """Raises `UserError` if a domain with these bodies cannot have this change."""
     if change.extra:
         raise UserError(f"Brax tasks take no extra values: {dict(change.extra)}.")
     check_names("body", change.bodies, bodies)

@@ -1,4 +1,4 @@
-"""Simulators side by side on the host, in processes where there are cores for them."""
+"""Several simulators on the host; each has its own process if there are cores."""
 
 import functools
 import os
@@ -18,13 +18,13 @@ Array = NDArray[Any]
 
 
 class StepResult(NamedTuple):
-    """What a step gave in each lane.
+    """The result of a step in each lane.
 
     Attributes:
       observation: `[lanes, observations]` float32.
       reward: `[lanes]` float32.
       terminal: `[lanes]` bool, ended by the task.
-      success: `[lanes]` bool; False where none is known.
+      success: `[lanes]` bool; False if the environment does not report it.
     """
 
     observation: Array
@@ -36,19 +36,19 @@ class StepResult(NamedTuple):
 class VectorEnv:
     """Simulators that are reset and stepped together.
 
-    They are no state of a run, but remember where they are: what seeds and actions
-    lead to can be had again by resetting and stepping.
+    They hold no state that a run must save: seeds and actions reproduce it by resetting
+    and stepping.
 
     Attributes:
-      task: index of the task that is played, -1 before the first reset.
+      task: index of the current task, -1 before the first reset.
       seeds: `[lanes]` int64, of the running episodes.
       steps: `[lanes]` int, of the running episodes.
       observation: `[lanes, observations]`, the latest.
     """
 
     def __init__(self, environment: HostEnvironment, count: int):
-        """Makes the simulators; a process each, unless this one is as fast."""
-        # Only those who have such an environment have gymnasium.
+        """Makes the simulators, each in a process unless this one is as fast."""
+        # gymnasium is installed only with such an environment.
         from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
         makers = [environment.make] * count
@@ -57,7 +57,7 @@ class VectorEnv:
             self._vector: Any = SyncVectorEnv(makers, autoreset_mode=mode)
         else:
             with _deaf_to_interrupts():
-                # JAX has threads, which a forked process would lack.
+                # JAX has threads, and a forked process would lose them.
                 self._vector = AsyncVectorEnv(
                     makers, context="spawn", autoreset_mode=mode, max_concurrency=cores
                 )
@@ -74,7 +74,7 @@ class VectorEnv:
         Args:
           task: its index, the same in all lanes.
           seeds: `[lanes]` int.
-          where: `[lanes]` bool, the lanes that begin one; all if None.
+          where: `[lanes]` bool, the lanes that begin an episode; all if None.
 
         Returns:
           `[lanes, observations]` float32, the latest of each lane.
@@ -103,20 +103,20 @@ class VectorEnv:
 
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
-    """Processes that are started here go on at Ctrl-C, until the first one ends them.
+    """Processes that start here ignore Ctrl-C; the main process ends them.
 
     Raises:
-      UserError: they end while they start.
+      UserError: they ended while they started.
     """
-    # Started later, it would let interrupts through again.
+    # Started inside the block, the tracker would unblock interrupts again.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     except (EOFError, ConnectionError) as error:
         raise UserError(
-            "the simulators' processes end while they start: a script must train under "
-            "`if __name__ == '__main__':`, since they import it"
+            "the processes of the simulators ended while they started: they import the "
+            "main script, so it must train under `if __name__ == '__main__':`"
         ) from error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -124,7 +124,7 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _whole() -> Iterator[None]:
-    """What is left in its middle serves nobody any more."""
+    """Drops the simulators if an exception interrupts a call to them."""
     try:
         yield
     except BaseException:
@@ -133,7 +133,7 @@ def _whole() -> Iterator[None]:
 
 
 def _cores() -> int:
-    """How many this process may use."""
+    """Number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not Linux
@@ -141,16 +141,16 @@ def _cores() -> int:
 
 
 def draw_seed(*words: int) -> int:
-    """A seed that follows from some numbers."""
+    """A seed that these numbers determine."""
     return int(np.random.SeedSequence(words).generate_state(1)[0])
 
 
 def shown(observation: Array, task: Task, shape: tuple[int, ...]) -> Array:
-    """What a policy is shown, `[*shape, observations]`."""
+    """The masked observation for the policy, `[*shape, observations]`."""
     return observation.reshape(*shape, -1) * np.asarray(task.observation_mask)
 
 
 @functools.lru_cache(maxsize=1)
 def open_lanes(environment: HostEnvironment, count: int) -> VectorEnv:
-    """So many lanes; asked for again, the same, since starting them takes seconds."""
+    """Simulators in `count` lanes. The last ones are reused: starting takes seconds."""
     return VectorEnv(environment, count)

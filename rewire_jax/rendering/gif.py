@@ -1,4 +1,4 @@
-"""A film as an animated picture, where MuJoCo can draw without a window."""
+"""Writes a film as a GIF, if MuJoCo can draw without a window."""
 
 import contextlib
 import copy
@@ -16,24 +16,24 @@ from rewire_jax.core.errors import UserError, writing
 from rewire_jax.envs import geom_trajectory as films
 from rewire_jax.envs.geom_trajectory import Film
 
-_FRAME = 0.05  # seconds; frames of the film between these are left out
-_TICK = 0.01  # seconds; what a GIF counts in
+_FRAME = 0.05  # seconds between two frames of the GIF
+_TICK = 0.01  # seconds; the unit of time of a GIF
 
 
 def write_gif(
     film: Film, path: Path, *, seconds: float, width: int = 400, height: int = 300
 ) -> None:
-    """Draws the beginning of a film.
+    """Writes the beginning of a film as a GIF.
 
     Args:
-      film: of two frames or more.
+      film: at least two frames.
       path: of the file.
-      seconds: how much of it.
-      width: in pixels, at most what the model allows, as the height.
+      seconds: length of the beginning.
+      width: in pixels; the model limits width and height.
       height: in pixels.
 
     Raises:
-      UserError: nothing can be drawn here, or the file cannot be written.
+      UserError: MuJoCo cannot draw here, or the file cannot be written.
     """
     step = max(1, round(_FRAME / film.seconds))
     frames = np.arange(0, len(film.position), step)
@@ -54,8 +54,8 @@ def write_gif(
 def _draw(film: Film, frames: Any, width: int, height: int) -> list[Any]:
     """`[height, width, 3]` uint8 for each of the frames."""
     model = copy.copy(film.model)
-    # A plane has no end in the simulation, whatever is drawn of it. What is on it is
-    # repeated every two metres.
+    # Planes are infinite in the simulation, so they are drawn as infinite. Their
+    # texture repeats every two metres.
     planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_size[planes, :2] = 0
     model.mat_texrepeat[model.geom_matid[planes & (model.geom_matid >= 0)]] = 0.5
@@ -67,7 +67,7 @@ def _draw(film: Film, frames: Any, width: int, height: int) -> list[Any]:
     gaze, size = films.gaze(film)
     camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
     camera.distance, camera.azimuth, camera.elevation = 4.5 * size, 105, -18
-    # Sites stay where they were when the model was made.
+    # Hides the sites, which do not move.
     option.sitegroup[:] = 0
     scene = mujoco.MjvScene(model, maxgeom=10 * model.ngeom)
     scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
@@ -90,17 +90,17 @@ def _draw(film: Film, frames: Any, width: int, height: int) -> list[Any]:
 
 @contextlib.contextmanager
 def _opened(model: Any, width: int, height: int) -> Iterator[Any]:
-    """Something to draw on, without a window; by `MUJOCO_GL` where that is set."""
+    """A context to draw without a window; `MUJOCO_GL` chooses its kind."""
     try:
         if sys.platform == "linux" and not os.environ.get("MUJOCO_GL"):
-            # MuJoCo's own choice here needs a screen.
+            # MuJoCo's default on Linux needs a screen.
             from mujoco.egl import GLContext
         else:
             from mujoco.gl_context import GLContext
         window = GLContext(width, height)
         window.make_current()
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    except Exception as error:  # Each platform has its own kinds.
+    except Exception as error:  # Each platform raises other types.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UserError(
             f"MuJoCo cannot draw without a window here ({reason}): install EGL, or set "

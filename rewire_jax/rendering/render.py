@@ -1,4 +1,4 @@
-"""An episode of a run, played with what it has learned, to be looked at."""
+"""Plays an episode with a learned policy and renders it."""
 
 import math
 from collections.abc import Callable
@@ -24,12 +24,12 @@ class Rendered(NamedTuple):
 
     Attributes:
       title: scenario and task.
-      caption: whose policy it was, and the episode's return and length.
-      returns: undiscounted.
-      steps: in the episode.
+      caption: the policy, and the episode's return and length.
+      returns: undiscounted return of the episode.
+      steps: length of the episode.
       page: the web page.
       gif: the animation; None if there is none.
-      note: why there is none, if one was asked for.
+      note: why there is no GIF, if one was requested.
     """
 
     title: str
@@ -42,7 +42,7 @@ class Rendered(NamedTuple):
 
 
 class _Played(NamedTuple):
-    """An episode: a frame before the first step and after each, what each step gave."""
+    """An episode: a first frame, then a frame, reward and success for each step."""
 
     film: Film
     rewards: list[float]
@@ -60,27 +60,27 @@ def render(
     out: str | Path = "episode.html",
     seconds: float = 10.0,
 ) -> Rendered:
-    """Plays one episode without exploration, and writes a web page that shows it.
+    """Plays one episode without exploration and writes a web page that shows it.
 
-    The page needs no network and no other file. Where MuJoCo can draw without a
-    window, a GIF of the episode's beginning is written beside it.
+    The page needs no network and no other file. If MuJoCo can draw without a window,
+    this also writes a GIF of the beginning of the episode.
 
     Args:
       run: folder of the run, or of a sweep.
       task: which task of the sequence to play, from 0.
-      seed: whose policy; the run's first if None.
-      stage: as it was after this task's training; after the latest if None.
-      member: of a sweep, in place of the seed; its number, as in members.csv.
-      episode: which one: where it starts follows from this number alone.
-      out: the page, whose name ends in `.html`; the GIF has the same name.
-      seconds: of the episode in the GIF; 0 for no GIF.
+      seed: of the member whose policy plays; the run's first if None.
+      stage: use the policy from after this task's training; the latest if None.
+      member: only for a sweep, instead of the seed: a number in members.csv.
+      episode: a number that determines the start of the episode.
+      out: the page; its name ends in `.html`. The GIF has the same name.
+      seconds: length of the GIF; 0 for no GIF.
 
     Returns:
-      What was written, and how the episode went.
+      The files, and the result of the episode.
 
     Raises:
-      UserError: no such run, task, seed, member or stage, a task that the policy has
-        not learned (unless `stage` is given), or nothing that can be seen.
+      UserError: no such run, task, seed, member or stage; the policy has not learned
+        the task and `stage` is None; or the environment cannot be rendered.
     """
     page = Path(out)
     require(page.suffix == ".html", f"--out {page}: a web page's name ends in .html")
@@ -94,8 +94,8 @@ def render(
     learned = _learned(folder, member) if stage is None else stage + 1
     require(
         task < learned or stage is not None,
-        f"{folder}: task {task} has not been trained yet; --stage {learned - 1} shows "
-        "what is done there without",
+        f"{folder}: task {task} has not been trained yet; to render the policy anyway, "
+        f"add --stage {learned - 1}",
     )
     scenario = make_scenario(settings.scenario, settings.backend, settings.reward)
     played = _play(scenario, scenario.tasks[task].data, act, episode)
@@ -110,7 +110,7 @@ def render(
         f"{episode}: return {returns:.1f} in {steps} steps"
         f"{', solved' if any(played.success) else ''}"
     )
-    # Only here is needed what takes long to import.
+    # These imports are slow and needed only here.
     from rewire_jax.rendering import webpage
     from rewire_jax.rendering.gif import write_gif
 
@@ -118,7 +118,7 @@ def render(
     gif = page.with_suffix(".gif")
     with writing(page):
         page.write_text(webpage.to_html(played.film, title, caption), encoding="utf-8")
-        gif.unlink(missing_ok=True)  # that of another episode
+        gif.unlink(missing_ok=True)  # of another episode
     rendered = Rendered(title, caption, returns, steps, page)
     if not seconds:
         return rendered
@@ -130,14 +130,14 @@ def render(
 
 
 def _learned(folder: Path, member: int | None) -> int:
-    """How many tasks of the sequence the latest policy has learned."""
+    """Number of tasks that the latest policy has learned."""
     if member is not None:
         folder = sweep_members.find(folder, member, None).folder
     return checkpoint.read_metadata(run_state.kept(folder, None))["stage"]
 
 
 def _play(scenario: Scenario, task: Task, act: PolicyFunction, episode: int) -> _Played:
-    """Plays one episode; `UserError` if there is nothing to see."""
+    """Plays one episode; `UserError` if the environment cannot be rendered."""
     environment = scenario.environment
     if isinstance(environment, HostEnvironment):
         played = _hosted(environment, task, jax.jit(act), episode)
@@ -145,8 +145,8 @@ def _play(scenario: Scenario, task: Task, act: PolicyFunction, episode: int) -> 
         played = _simulated(environment, task, jax.jit(act), episode)
     if played is None:
         raise UserError(
-            f"{scenario.name} on {scenario.backend} has nothing to see: halfcheetah, "
-            "ant and humanoid have, and Meta-World on mujoco"
+            f"cannot render {scenario.name} on {scenario.backend}: choose halfcheetah, "
+            "ant or humanoid, or Meta-World on mujoco"
         )
     return played
 

@@ -1,4 +1,4 @@
-"""A film as a web page that needs nothing but itself: no network, no other file."""
+"""A film as a web page in one file, which needs no network."""
 
 import html
 import json
@@ -16,21 +16,21 @@ from trimesh.viewer import scene_to_html
 from rewire_jax.envs import geom_trajectory as films
 from rewire_jax.envs.geom_trajectory import Film
 
-# The browser itself sees to it that nothing is loaded from elsewhere.
+# The browser itself blocks everything that is not in the file.
 _POLICY = (
     '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
     "script-src 'unsafe-inline'; style-src 'unsafe-inline'; connect-src data:\">"
 )
 _PLAYER = Path(__file__).with_name("player.html")
-# Where the camera stands in the beginning, in sizes of what it looks at.
+# First position of the camera, in units of the size of what it looks at.
 _CAMERA = np.array([1.2, -4.0, 1.4])
 
 
 def to_html(film: Film, title: str, caption: str) -> str:
-    """The page: trimesh's viewer, which brings three.js along, and a player.
+    """The page: trimesh's viewer, which includes three.js, and a player.
 
     Args:
-      film: of two frames or more.
+      film: at least two frames.
       title: plain text.
       caption: plain text.
     """
@@ -51,12 +51,12 @@ def to_html(film: Film, title: str, caption: str) -> str:
 
 
 def to_json(film: Film) -> dict[str, Any]:
-    """What moves, as the player reads it.
+    """The motion, as the player reads it.
 
     Returns:
       names `[moving]` of nodes in the scene, position `[frames, moving, 3]`, rotation
-      `[frames, moving, 4]` (x, y, z, w), gaze `[frames, 3]`, camera `[3]` beside it,
-      floor (its height), size, and seconds from frame to frame.
+      `[frames, moving, 4]` (x, y, z, w), gaze `[frames, 3]`, camera `[3]` relative to
+      the gaze, floor (its height), size, and seconds between two frames.
     """
     moving = films.movable(film)
     rotation = Rotation.from_matrix(film.rotation[:, moving].reshape(-1, 3, 3))
@@ -84,7 +84,7 @@ def _name(geom: int) -> str:
 
 def _scene(film: Film) -> trimesh.Scene:
     """The first frame, a node for each geometry."""
-    # Without a name of ours a camera gets another one each time; the player moves it.
+    # Without this name, the camera gets a random one, and the player could not find it.
     camera = trimesh.scene.Camera(name="camera", fov=(40, 40))
     scene = trimesh.Scene(camera=camera, camera_transform=np.eye(4))
     for geom in films.solids(film):
@@ -104,7 +104,7 @@ def _scene(film: Film) -> trimesh.Scene:
 
 
 def _mesh(model: Any, geom: int) -> trimesh.Trimesh:
-    """A geometry's surface, about its own axes."""
+    """The surface of a geometry, in its own frame."""
     kind, size = mujoco.mjtGeom(model.geom_type[geom]), model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return trimesh.creation.box(2 * size)
@@ -125,6 +125,6 @@ def _mesh(model: Any, geom: int) -> trimesh.Trimesh:
         mesh = trimesh.creation.uv_sphere(count=(16, 24))
         sphere = kind == mujoco.mjtGeom.mjGEOM_SPHERE
         mesh.apply_scale(size[[0, 0, 0]] if sphere else size)
-    # Asked for, they are part of the page: round things look round.
+    # Once computed, normals are part of the page. They make round things look round.
     _ = mesh.vertex_normals
     return mesh

@@ -1,4 +1,4 @@
-"""Looking at scenarios and at finished runs."""
+"""Facts about scenarios, and evaluations of runs."""
 
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,10 @@ from rewire_jax.training.run_setup import base_size, make_spec, prepare
 
 
 def info(scenario: Scenario) -> dict[str, Any]:
-    """What there is to know about a scenario before running it, JSON-ready.
+    """Facts about a scenario, JSON-ready.
 
-    The model size is the largest that a method can reach in it with the paper
-    profile, divided by that of a plain policy.
+    The model size of a method is the largest that it can reach in this scenario with
+    the paper profile, divided by the size of a plain policy.
     """
     sizes = {}
     for method in METHODS:
@@ -51,11 +51,12 @@ def info(scenario: Scenario) -> dict[str, Any]:
 
 
 def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
-    """The most numbers that a method stores in a run over the whole sequence.
+    """The largest count of numbers that a method stores in a run over all tasks.
 
     Returns:
-      That of a run in which the first of the method's candidates is always the best,
-      and that of one in which it is the last: what is stored may depend on it.
+      Two counts, because the count may depend on which candidate wins: for a run in
+      which the method's first candidate always wins, and for one in which its last
+      does.
     """
     method = find_method(name).make(spec, options)
 
@@ -76,7 +77,7 @@ def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
         _, sizes = jax.lax.scan(one, method.init(key), jnp.arange(spec.tasks))
         return jnp.max(sizes)
 
-    # What the count does not need is left out of the compiled function.
+    # The compiler removes everything that the count does not need.
     numbers = jax.jit(jax.vmap(run))(jnp.array([True, False]))
     return [int(number) for number in numbers]
 
@@ -84,18 +85,19 @@ def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
 def evaluate(
     run: str | Path, *, stage: int | None = None, episodes: int = 128, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Plays all tasks of a run without exploration.
+    """Evaluates a run on all its tasks, without exploration.
 
     Args:
       run: folder of the run.
-      stage: as it was after this task's training; the latest if None.
-      episodes: for each task and member.
+      stage: evaluate the policies from after this task's training; the latest if None.
+      episodes: number for each task and member.
       seed: of the episodes.
 
     Returns:
-      A row for each member and task: task, name, seed (the member's), return, std
-      (over episodes), steps (in all episodes), and, where it is known, success and
-      success_last: shares of the episodes solved at any step, and at the last.
+      A row for each member and task: task, name, seed (the member's), return, std (over
+      episodes), steps (of all episodes). If the environment defines success, also
+      success and success_last: the share of episodes solved at any step, and at the
+      last.
 
     Raises:
       UserError: no such run or stage, or a damaged checkpoint.

@@ -1,7 +1,7 @@
-"""Ctrl-C, noticed at once.
+"""Reacts to Ctrl-C at once.
 
-Python runs its signal handlers when the main thread comes back to it, which may be
-minutes after the signal where that thread waits for what is computed or compiled.
+Python runs its signal handlers in the main thread, between two instructions. While that
+thread waits for a computation or a compilation, this may be minutes after the signal.
 """
 
 import os
@@ -31,9 +31,9 @@ class Interrupt:
 
 @contextmanager
 def noticed(act: Callable[[int], None]) -> Iterator[None]:
-    """Calls `act(1)`, `act(2)`, ... at each Ctrl-C, from a thread of its own.
+    """Calls `act(1)`, `act(2)`, ... at each Ctrl-C, from another thread.
 
-    Handlers are run as well. One such context may be within another.
+    Python's handlers run too. Such contexts may be nested.
 
     Raises:
       ValueError: this is not the main thread.

@@ -1,7 +1,7 @@
-"""Where a run's scalars go beside its tables: TensorBoard, Weights & Biases.
+"""Logs a run's scalars to TensorBoard and to Weights & Biases.
 
-Each member has a log of its own. What counts is in the tables; these are for looking
-at. Whatever fails in them is told once, and training goes on without them.
+Each member has its own log. The result tables do not depend on the logs. If a log
+fails, a message says so once, and training continues without it.
 """
 
 import contextlib
@@ -21,12 +21,12 @@ from rewire_jax.training.population import Member
 
 
 class Subject(NamedTuple):
-    """Whose scalars are logged.
+    """The member whose scalars are logged.
 
     Attributes:
       folder: of the run or sweep.
-      name: the member's, unlike any other in the folder.
-      group: what the members have in common.
+      name: the member's, unique in the folder.
+      group: a name that all members share.
       settings: the member's, JSON-ready.
     """
 
@@ -40,9 +40,10 @@ class Logger(NamedTuple):
     """The log of one member.
 
     Attributes:
-      scalars: takes a kind, "training" or "evaluation", numbers by name, and the
-        interactions made by then. The times of a kind only grow.
-      close: there is no more to come.
+      scalars: logs numbers by name. Its arguments are a kind, "training" or
+        "evaluation", the numbers, and the interactions so far; within a kind these only
+        grow.
+      close: ends the log.
     """
 
     scalars: Callable[[str, Mapping[str, float], int], None]
@@ -50,13 +51,13 @@ class Logger(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """How logs of one kind are opened.
+    """How to open logs of one kind.
 
     Attributes:
-      package: that must be installed; the extra has the kind's own name.
-      open: from whose it is and the number of interactions from which on nothing is
-        known. The run may have been stopped and resumed: what was logged later than
-        that will be logged again.
+      package: the required package; the extra has the name of the kind.
+      open: opens the log of a member. Its second argument is the number of interactions
+        at which the run starts or resumes. Everything that was logged after this number
+        will be logged again.
     """
 
     package: str
@@ -64,8 +65,8 @@ class Kind(NamedTuple):
 
 
 def open_tensorboard(subject: Subject, begin: int) -> Logger:
-    """Event files in `tensorboard/`, on disk after each call."""
-    # SummaryWriter's thread, once it has failed, leaves its caller waiting for ever.
+    """Event files in `tensorboard/`, flushed to disk after each call."""
+    # If SummaryWriter's thread fails, its caller waits forever.
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto.event_pb2 import Event, SessionLog
     from tensorboardX.proto.summary_pb2 import Summary
@@ -73,7 +74,7 @@ def open_tensorboard(subject: Subject, begin: int) -> Logger:
     folder = subject.folder / "tensorboard" / subject.name
     folder.mkdir(parents=True, exist_ok=True)
     writer = EventsWriter(str(folder / "events"), f".{begin:012d}")
-    # Hides what an earlier file has from here on.
+    # Hides what an earlier file has logged after this point.
     start = SessionLog(status=SessionLog.START)
     writer.write_event(Event(wall_time=time.time(), step=begin, session_log=start))
 
@@ -91,11 +92,11 @@ def open_tensorboard(subject: Subject, begin: int) -> Logger:
 
 
 def open_wandb(subject: Subject, begin: int) -> Logger:
-    """A run at Weights & Biases, or with WANDB_MODE=offline in `wandb/`.
+    """A run at Weights & Biases, or in `wandb/` with WANDB_MODE=offline.
 
-    That folder also has each run's id and how far it was logged: a run that is resumed
-    goes on under the same id, and logs nothing twice. What was logged in the second
-    before a kill may be lost.
+    The folder `wandb/` also stores the id of each run and how far it was logged. So a
+    resumed run continues under the same id and logs nothing twice. A kill may lose what
+    was logged in the last second.
 
     Raises:
       ConnectionError: there is no API key, or no network.
@@ -112,7 +113,7 @@ def open_wandb(subject: Subject, begin: int) -> Logger:
         known = json.loads(path.read_text())
     path.parent.mkdir(parents=True, exist_ok=True)
     offline = os.environ.get("WANDB_MODE", "online") != "online"
-    # It would ask at the terminal, in the middle of the display.
+    # Otherwise it would ask for the key in the middle of the display.
     if not offline and not wandb.login(prompt=False):
         raise ConnectionError("no API key: run `wandb login` or set WANDB_MODE=offline")
     run = wandb.init(
@@ -132,7 +133,7 @@ def open_wandb(subject: Subject, begin: int) -> Logger:
         ),
     )
     run_folder.write(path, known)
-    # Not its own steps: those are lost where they do not grow.
+    # wandb drops values whose own step does not grow, so the axis is a metric.
     run.define_metric("interactions", hidden=True)
     run.define_metric("*", step_metric="interactions")
 
@@ -153,7 +154,7 @@ KINDS = {
 
 
 def check(kinds: Sequence[str]) -> None:
-    """Raises `UserError` for logs of an unknown kind, or whose package is missing."""
+    """Raises `UserError` if a kind of log is unknown or its package is missing."""
     for kind in kinds:
         known = ", ".join(KINDS)
         require(kind in KINDS, f"unknown log {kind!r}: choose among {known}")
@@ -165,7 +166,7 @@ def check(kinds: Sequence[str]) -> None:
 
 
 def subject(folder: Path, settings: Settings, member: Member, name: str) -> Subject:
-    """Whose log a member's is."""
+    """The `Subject` of a member's log."""
     own = dataclasses.replace(
         settings, seed=member.seed, seeds=1, sac=member.sac, options=member.options
     )
@@ -174,7 +175,7 @@ def subject(folder: Path, settings: Settings, member: Member, name: str) -> Subj
 
 
 class Loggers:
-    """The logs of some members, open for as long as the context lasts."""
+    """The logs of some members; leaving the context closes them."""
 
     def __init__(
         self,
@@ -185,9 +186,9 @@ class Loggers:
         """Opens nothing yet.
 
         Args:
-          kinds: of logs, as `check` allows them.
+          kinds: kinds of logs that `check` allows.
           subjects: one for each member, in their order.
-          say: is told what fails.
+          say: receives a message if a log fails.
         """
         self._kinds = tuple(kinds)
         self._subjects = tuple(subjects)
@@ -195,7 +196,7 @@ class Loggers:
         self._open: dict[str, list[Logger]] = {}
 
     def open(self, begin: int) -> None:
-        """Opens them; `begin` is as in `Kind`."""
+        """Opens the logs; `begin` is the second argument of `Kind.open`."""
         for kind in self._kinds:
             with self._guarded(kind):
                 opened = self._open[kind] = []
@@ -209,7 +210,7 @@ class Loggers:
         values: Mapping[str, float | None],
         interactions: int,
     ) -> None:
-        """Logs what is known of a member's values; see `Logger`."""
+        """Logs the values of the member at `place`, except None; see `Logger`."""
         finite = {name: value for name, value in values.items() if value is not None}
         for each, logs in list(self._open.items()):
             with self._guarded(each):
@@ -231,4 +232,4 @@ class Loggers:
         except Exception as error:
             self._open.pop(kind, None)
             reason = " ".join(str(error).split()) or type(error).__name__
-            self._say(f"--log {kind} failed and is off from here on: {reason}")
+            self._say(f"--log {kind} failed and is now off: {reason}")

@@ -1,4 +1,4 @@
-"""Policies of a finished or running run, as plain functions."""
+"""Policies of a run, finished or not, as plain functions."""
 
 import functools
 from collections.abc import Callable
@@ -24,13 +24,14 @@ PolicyFunction = Callable[[jax.Array], jax.Array]
 
 
 class Policies(NamedTuple):
-    """The policies of all members of a run: arrays, and one pure function of them.
+    """The policies of all members of a run: arrays, and a pure function of them.
 
     Attributes:
-      act: `(member, task, observation) -> action` for a member's `Learned`, a `[]` int
-        and `[..., observations]`; action `[..., actions]` in [-1, 1], without
-        exploration. It can be jitted, and vmapped over members, tasks or both.
-      members: what all have learned, `[seeds]` on the leading axis of every leaf.
+      act: `(member, task, observation) -> action`. `member` is a `Learned`, `task` a
+        `[]` int, `observation` `[..., observations]`. The action `[..., actions]` is in
+        [-1, 1], without exploration. You can jit it, and vmap it over members, tasks
+        or both.
+      members: of all members, with a leading axis `[seeds]` on every leaf.
       seeds: of the members, in their order.
       tasks: names of the sequence.
     """
@@ -49,19 +50,19 @@ def load_policy(
     stage: int | None = None,
     member: int | None = None,
 ) -> PolicyFunction:
-    """A learned policy as a pure function; nothing but the run's folder is needed.
+    """Loads a learned policy as a pure function, from the folder of a run.
 
     Args:
       run: folder of the run, or of a sweep.
       task: which task of the sequence to act in, from 0. A task not yet learned at
         that stage gets the latest policy.
-      seed: of which member; the run's first if None.
-      stage: as it was after this task's training; after the latest if None.
-      member: of a sweep, in place of the seed; its number, as in members.csv.
+      seed: of the member; the run's first if None.
+      stage: load the policy from after this task's training; the latest if None.
+      member: only for a sweep, instead of the seed: a number in members.csv.
 
     Returns:
-      Observation `[..., observations]` (as the scenario's environment gives it) to
-      action `[..., actions]`, without exploration. It can be jitted and vmapped.
+      A function from an observation `[..., observations]` of the scenario's environment
+      to an action `[..., actions]`, without exploration. You can jit and vmap it.
 
     Raises:
       UserError: no such run, task, seed, member or stage, or a damaged checkpoint.
@@ -96,11 +97,11 @@ def load_policy(
 
 
 def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
-    """All policies of a run at once, to be vmapped over, compared and taken apart.
+    """Loads all policies of a run at once, for example to vmap over or compare them.
 
     Args:
       run: folder of the run.
-      stage: as they were after this task's training; after the latest if None.
+      stage: load the policies from after this task's training; the latest if None.
 
     Raises:
       UserError: no such run or stage, a sweep, or a damaged checkpoint.
@@ -120,13 +121,13 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
 
 
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
-    """A folder's header, and what it says."""
+    """A folder's header, its settings and its sizes."""
     header, settings = saved(folder, kind)
     return header, settings, Spec(**header["spec"])
 
 
 def _load(found: Found, method: Method) -> Learned:
-    """What those have learned that were trained side by side, `[num_slots]`."""
+    """What the members that trained together have learned, `[num_slots]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.num_slots))
     like = jax.eval_shape(jax.vmap(method.init), keys)
     learned = run_state.read_policies(found.folder, found.stage, like)

@@ -1,4 +1,4 @@
-"""A live display of a run in the terminal; plain lines where there is none."""
+"""A live display of a run in the terminal; plain lines without a terminal."""
 
 import math
 import sys
@@ -13,20 +13,20 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-_MOST_NAMES = 6  # with more, their returns are shown as mean and range
+_MOST_NAMES = 6  # with more members, shows the mean and range of their returns
 
 
 class Progress:
-    """Shows where a run is; used as a context manager.
+    """Shows the progress of a run; a context manager.
 
-    Without a terminal nothing is written but a line for each finished task and for
-    each message, without control codes.
+    Without a terminal it writes only a line for each finished task and each message,
+    without control codes.
 
     Args:
         tasks: names of the whole sequence.
-        total: interactions a task.
-        members: their names, in the order of the returns given later.
-        label: what is running, such as method and scenario.
+        total: interactions of each task.
+        members: names of the members, in the order of the returns in `update`.
+        label: names the run, such as method and scenario.
         file: where to write, by default the standard error output.
         console: used instead of one made for `file`.
     """
@@ -45,13 +45,13 @@ class Progress:
         self._total = total
         self._members = tuple(members)
         self._label = label
-        # In a notebook Rich would write HTML into the cell instead.
+        # Otherwise Rich would write HTML into the cell of a notebook.
         self._console = console or Console(file=file or sys.stderr, force_jupyter=False)
         self._live: Live | None = None
 
     def __enter__(self) -> Self:
         if self._console.is_terminal and not self._console.is_dumb_terminal:
-            # Refreshed by `update` alone: a thread of its own would take from training.
+            # Only `update` refreshes it: another thread would slow down training.
             self._live = Live(
                 Text(f"{self._label}: starting"),
                 console=self._console,
@@ -84,10 +84,10 @@ class Progress:
 
         Args:
             stage: index of the task in training.
-            interactions: made in this task, by each member.
-            returns: latest training return of each member, None where there is none.
-            rate: interactions/s of all members together, None where there are none.
-            seconds_left: of the whole run, None where it cannot be told yet.
+            interactions: of each member in this task so far.
+            returns: latest training return of each member; None if there is none yet.
+            rate: interactions/s of all members together; None if unknown.
+            seconds_left: of the whole run; None if unknown.
             note: anything else, such as "evaluating".
         """
         if self._live is None:
@@ -121,7 +121,7 @@ class Progress:
         Args:
             stage: index of the task.
             returns: evaluation return of each member on this task.
-            seconds: what the task took.
+            seconds: duration of the task.
         """
         self.message(
             f"{self._label}: {self._name(stage)} finished in {_clock(seconds)}, "
@@ -129,14 +129,14 @@ class Progress:
         )
 
     def message(self, text: str) -> None:
-        """Prints a line, above the live display where there is one."""
+        """Prints a line, above the live display if there is one."""
         self._console.print(Text(text), soft_wrap=True)
 
     def _name(self, stage: int) -> str:
         return f"task {stage + 1} of {len(self._tasks)}, {self._tasks[stage]}"
 
     def _returns(self, returns: Sequence[float | None]) -> str:
-        """One return a member, or their mean and range."""
+        """The return of each member, or their mean and range."""
         if len(returns) <= _MOST_NAMES:
             pairs = zip(self._members, returns, strict=True)
             return "  ".join(f"{name}: {_number(x)}" for name, x in pairs)

@@ -1,14 +1,14 @@
-"""The order of configurations by what their seeds scored."""
+"""The order of configurations by the scores of their seeds."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
 def rank(scores: ArrayLike) -> NDArray[np.intp]:
-    """Configurations, the best first.
+    """Sorts configurations, the best first.
 
-    Those with fewer diverged seeds stand before the others, among them those with a
-    higher mean over the seeds that are left; what is still equal stays in its order.
+    Fewer diverged seeds come first, then the higher mean over the other seeds. Equal
+    configurations keep their order.
 
     Args:
         scores: `[configurations, seeds]`, NaN for a seed that diverged.
@@ -19,6 +19,6 @@ def rank(scores: ArrayLike) -> NDArray[np.intp]:
     scores = np.asarray(scores, np.float64)
     lost = np.isnan(scores).sum(axis=1)
     left = scores.shape[1] - lost
-    # Where no seed is left there is nothing to compare: the order says no more.
+    # If all seeds of a configuration diverged, its mean is 0.
     means = np.nansum(scores, axis=1) / np.maximum(left, 1)
     return np.lexsort((-means, lost))

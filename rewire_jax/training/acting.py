@@ -10,12 +10,12 @@ from rewire_jax.methods.base import Method, Policy
 
 
 class Learned(NamedTuple):
-    """What a member has learned; its policies are made from nothing else.
+    """Everything that a member has learned; it determines the member's policies.
 
     Attributes:
-      params: what its method trains.
-      method_state: what its method keeps from task to task; of `rewire`,
-        `orders` `[slots, L, n]`, the cached wirings.
+      params: the parameters of its method.
+      method_state: what its method carries from task to task; for `rewire`, among
+        others `orders` `[slots, L, n]`, the cached wirings.
     """
 
     params: Any

@@ -1,4 +1,4 @@
-"""Exploring actions, and the noise that they may take."""
+"""Exploration: actions in training, and their noise."""
 
 from typing import Any, NamedTuple
 
@@ -13,14 +13,14 @@ from rewire_jax.training.random_keys import CollectKeys
 
 
 class ActionNoise(NamedTuple):
-    """What a step of all environments of a member leaves to chance.
+    """The random numbers of one step of all environments of a member.
 
     Attributes:
       context: key of the method's context, `[2]` uint32.
       extras: key of the method's extras, `[2]` uint32.
-      noise: `[envs, actions]`, of the policy's actions.
-      uniform: `[envs, actions]`, actions that take no heed of the policy.
-      blind: `[]` bool, whether these are taken.
+      noise: `[envs, actions]`, noise of the policy's actions.
+      uniform: `[envs, actions]`, uniform actions.
+      blind: `[]` bool, whether the uniform actions are used.
     """
 
     context: jax.Array
@@ -37,14 +37,14 @@ def sample_noise(
     random: int,
     sequence: jax.Array | None,
 ) -> ActionNoise:
-    """A draw for one step.
+    """The random numbers of one step.
 
     Args:
       key: a random key.
-      time: `[]` int, steps of all environments made before in the task.
-      size: of the actions, `envs, actions`.
-      random: steps in the task whose actions are uniform.
-      sequence: the coloured noise that `time` lies in, None where noise is white.
+      time: `[]` int, steps of all environments so far in the task.
+      size: shape of the actions, `envs, actions`.
+      random: number of steps at the start of the task with uniform actions.
+      sequence: the coloured noise that contains this step; None for white noise.
     """
     keys = random_keys.named(CollectKeys, key)
     if sequence is None:
@@ -68,18 +68,18 @@ def explore(
     steps: jax.Array,
     method: Method,
 ) -> tuple[jax.Array, Any]:
-    """Exploring actions of all environments of a member.
+    """The exploring actions of all environments of a member.
 
     Args:
-      draw: what is left to chance.
+      draw: the random numbers.
       acting: the method's parameters and state.
-      extras: the method's, of the step before.
+      extras: the method's, of the previous step.
       observation: `[envs, observations]`.
       steps: `[envs]` int, of the running episodes.
       method: the method.
 
     Returns:
-      Actions `[envs, actions]`, and the extras that belongs to the step.
+      Actions `[envs, actions]`, and the extras of this step.
     """
     params, method_state = acting
     extras_key, context_key = map(jax.random.wrap_key_data, (draw.extras, draw.context))
@@ -97,7 +97,7 @@ def sample_colored(
     length: int,
     settings: SacSettings,
 ) -> jax.Array:
-    """Coloured noise `[length, *size]`, as long as an episode, that a step lies in.
+    """The coloured noise `[length, *size]` of the episode that contains a step.
 
     Args:
       key: the task's, as in `train`.

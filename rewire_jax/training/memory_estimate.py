@@ -1,9 +1,9 @@
-"""What a member needs of a device's memory, known before anything is compiled.
+"""Estimates the device memory of a member, before anything is compiled.
 
-What is held is counted from shapes. What computing takes beside it is counted from the
-traced operations: the most that is active at once, if each result is kept from where it
-is made to its last use. XLA needs less where it fuses operations, and more where it
-copies.
+Stored arrays are counted from their shapes. Temporary arrays are counted from the
+traced operations: the estimate is the largest total at any time, if each result is kept
+from its operation to its last use. XLA needs less if it fuses operations, and more if
+it copies.
 """
 
 import functools
@@ -27,22 +27,22 @@ from rewire_jax.methods.base import map_own
 from rewire_jax.training import colored_noise, rollout, train_loop
 from rewire_jax.training.run_setup import Plan
 
-# Of a device's memory; the rest is for compiled code and what others hold.
+# Share of a device's memory; the rest is for compiled code and other programs.
 _SHARE = 0.8
-# With more a CPU's caches are too small, and each takes longer.
+# With more members, a CPU's caches are too small and each member takes longer.
 _SIDE_BY_SIDE = 8
 
 
 class Need(NamedTuple):
-    """Bytes that one member needs.
+    """The memory of one member, in bytes.
 
     Attributes:
-      learner: all that learning changes.
-      buffer: the replay buffer, held in training.
-      environments: held in training.
-      work: taken for a while beside these, by an update, a step or a choice.
-      evaluation: taken beside the learner, when there is no buffer; also to choose
-        between policies at a task's end.
+      learner: everything that learning changes.
+      buffer: the replay buffer, during training.
+      environments: the environments, during training.
+      work: temporary arrays of an update, a step or a selection, during training.
+      evaluation: temporary arrays of an evaluation, or of a selection at a task's end;
+        there is no buffer then.
     """
 
     learner: int
@@ -53,7 +53,7 @@ class Need(NamedTuple):
 
     @property
     def total(self) -> int:
-        """The most at any one time."""
+        """The largest total at any time."""
         training = self.buffer + self.environments + self.work
         return self.learner + max(training, self.evaluation)
 
@@ -64,7 +64,7 @@ class Need(NamedTuple):
 
 
 def _held(plan: Plan) -> tuple[Any, Any]:
-    """Shapes of a learner between tasks, and of all that is held within one."""
+    """Shapes of a learner between tasks, and of everything stored during a task."""
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     fresh = jax.eval_shape(plan.program.init, plan.stacked)
     active = jax.ShapeDtypeStruct((plan.num_slots,), bool)
@@ -72,18 +72,18 @@ def _held(plan: Plan) -> tuple[Any, Any]:
 
 
 def check(plan: Plan) -> None:
-    """Raises `UserError` if what is held in training alone is more than there is."""
+    """Raises `UserError` if the arrays stored in training exceed the memory."""
     held = size(_held(plan)[1])
     room = _total(list(plan.mesh.devices.flat))
     require(
         room is None or held <= room,
-        f"a run of this size holds {held / 1e9:.3g} GB, and there are "
-        f"{(room or 0) / 1e9:.3g}: lower --seeds, --buffer, --envs or --hidden",
+        f"a run of this size needs {held / 1e9:.3g} GB, but the memory has "
+        f"{(room or 0) / 1e9:.3g} GB: lower --seeds, --buffer, --envs or --hidden",
     )
 
 
 def need(plan: Plan) -> Need:
-    """Counts what each member of a plan needs; traces, but compiles nothing."""
+    """The memory of each member of a plan; traces, but compiles nothing."""
     program, settings, spec = plan.program, plan.settings, plan.spec
     environment, make = plan.scenario.environment, find_method(settings.method).make
     fresh, state = _held(plan)
@@ -108,7 +108,7 @@ def need(plan: Plan) -> Need:
         )
 
     def play(policies: Any, rows: int, episodes: int) -> int:
-        """For a member's policies, in as many tasks, and episodes of each of these."""
+        """Bytes for a member's policies in `rows` tasks, with `episodes` of each."""
         policies = map_own(lambda x: cut(x, 1, rows, axes=2), cut(policies, 1))
         if isinstance(environment, HostEnvironment):
             return size(policies)  # episodes take nothing of the device
@@ -161,12 +161,12 @@ def need(plan: Plan) -> Need:
 
 
 def size(tree: Any) -> int:
-    """Bytes of a pytree's arrays, which may be abstract."""
+    """Bytes of a pytree's arrays; they may be abstract."""
     return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def peak(function: Callable[..., Any], *arguments: Any) -> int:
-    """Bytes that a function's results take at most at a time, beside its arguments."""
+    """The largest total of a function's results at any time, without its arguments."""
     return _peak(jax.make_jaxpr(function)(*arguments).jaxpr)
 
 
@@ -182,7 +182,7 @@ def _peak(jaxpr: Jaxpr) -> int:
         given = sum(made.values())
         inside = max(map(_peak, jaxprs_in_params(equation.params)), default=0)
         if equation.primitive.name in ("scan", "while"):
-            # What it carries is kept while the next is made.
+            # The old carry is kept until the new one is complete.
             inside += given
         most = max(most, active + max(inside, given))
         held |= made
@@ -196,22 +196,22 @@ def _variables(equation: JaxprEqn) -> list[Var]:
 
 
 def device_bytes(devices: Sequence[jax.Device]) -> int:
-    """Bytes on these devices together that members may take.
+    """Bytes that members may use on these devices together.
 
     Raises:
-      UserError: a device does not tell.
+      UserError: a device does not report its memory.
     """
     total = _total(devices)
     if total is None:
         raise UserError(
-            f"{devices[0].device_kind} does not tell its memory: give "
+            f"{devices[0].device_kind} does not report its memory: set "
             "--members-per-batch"
         )
     return int(_SHARE * total)
 
 
 def _total(devices: Sequence[jax.Device]) -> int | None:
-    """Bytes of these devices together; None if one does not tell."""
+    """Bytes of these devices together; None if one does not report its memory."""
     if devices[0].platform == "cpu":
         # All CPU devices are one machine.
         return machine_bytes()
@@ -221,13 +221,13 @@ def _total(devices: Sequence[jax.Device]) -> int | None:
 
 
 def most_held() -> dict[str, int]:
-    """Bytes held at most so far.
+    """The peak memory so far, in bytes.
 
     Returns:
-      `process`: by this process on its machine; `device`: by all its devices together,
-      where they have memory of their own and tell.
+      `process`: of this process on its machine; `device`: of all its devices together,
+      if they have their own memory and report it.
     """
-    # In kilobytes, but on macOS.
+    # In kilobytes, except on macOS.
     unit = 1 if sys.platform == "darwin" else 1024
     held = {"process": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}
     stats = [device.memory_stats() or {} for device in jax.local_devices()]
@@ -246,7 +246,7 @@ def machine_bytes(root: Path = Path("/")) -> int:
 
 
 def _limits(root: Path) -> Iterator[int]:
-    """Of the control groups that the process is in; there are two versions of them."""
+    """Limits of the process's control groups, in both versions of cgroups."""
     try:
         groups = (root / "proc/self/cgroup").read_text().splitlines()
     except OSError:  # not Linux
@@ -261,7 +261,7 @@ def _limits(root: Path) -> Iterator[int]:
             continue
         inner = top / path.lstrip("/")
         for folder in (inner, *inner.parents):
-            # In a container the path may be one of the machine outside.
+            # In a container, the path may be that of the machine outside.
             text = _text(folder / name)
             if text.isdecimal():  # not "max"
                 yield int(text)
@@ -275,19 +275,19 @@ def _text(path: Path) -> str:
 
 
 def fitting(each: Need, devices: Sequence[jax.Device]) -> int:
-    """How many such members are best trained side by side on these devices.
+    """The number of members to train at once on these devices.
 
     Raises:
-      UserError: there is no room for one.
+      UserError: one member does not fit.
     """
     room = device_bytes(devices)
-    # On a CPU all devices take from the same room.
+    # All CPU devices share the same memory.
     shares = 1 if devices[0].platform == "cpu" else len(devices)
     number = shares * (room // shares // each.total)
     require(
         number > 0,
-        f"{each}; there are {room / shares / 1e6:.3g} MB: lower --buffer, --envs or "
-        "--eval-episodes, or give --members-per-batch to try",
+        f"{each}; the memory has {room / shares / 1e6:.3g} MB: lower --buffer, --envs "
+        "or --eval-episodes, or set --members-per-batch to try anyway",
     )
     if devices[0].platform == "cpu":
         number = min(number, _SIDE_BY_SIDE * len(devices))

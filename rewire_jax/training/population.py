@@ -1,4 +1,4 @@
-"""Members of a population: configurations times seeds, and where they live."""
+"""The members of a population, configurations × seeds, and their devices."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -15,16 +15,16 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import SacSettings
 
 _AXIS = "members"
-_LONGEST = 1_000  # bytes that processes tell each other
+_LONGEST = 1_000  # bytes of a message between processes
 
 
 class Member(NamedTuple):
     """One member.
 
     Attributes:
-      number: its own in the run or sweep.
-      name: for people.
-      seed: all its randomness follows from it.
+      number: in the run or sweep.
+      name: a label for the user.
+      seed: determines all its randomness.
       sac: SAC's settings.
       options: the method's settings.
     """
@@ -37,7 +37,7 @@ class Member(NamedTuple):
 
 
 class Members(NamedTuple):
-    """What tells the members of a population apart, `[members]` on every leaf.
+    """The values that differ between members; every leaf is `[members]`.
 
     Attributes:
       keys: random keys, made from the seed alone.
@@ -53,7 +53,7 @@ class Members(NamedTuple):
 def cross(
     configurations: Sequence[tuple[SacSettings, Any]], seeds: Sequence[int]
 ) -> tuple[Member, ...]:
-    """Every configuration with every seed, the seeds of one side by side."""
+    """Every configuration with every seed; the seeds of one are consecutive."""
     pairs = [(pair, seed) for pair in configurations for seed in seeds]
     return tuple(
         Member(number, f"seed {seed}", seed, *pair)
@@ -65,7 +65,7 @@ _make_keys = jax.jit(jax.vmap(jax.random.key))
 
 
 def stack(members: Sequence[Member]) -> Members:
-    """Members side by side; they may differ only in their traced numbers."""
+    """Stacks members; they may differ only in their traced numbers."""
 
     def stacked(settings):
         return jax.tree.map(
@@ -84,12 +84,12 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
 
     Args:
       coordinator: `host:port` of the first process.
-      processes: how many there are; None where a cluster manager that JAX knows
-        tells it this, and which process this is.
+      processes: number of processes; None if a cluster manager that JAX knows sets
+        this and the next.
       process: number of this process.
 
     Raises:
-      UserError: numbers are missing or wrong, or the others cannot be reached.
+      UserError: a number is missing or wrong, or the other processes do not answer.
     """
     try:
         jax.distributed.initialize(coordinator, processes, process)
@@ -102,10 +102,10 @@ def join(coordinator: str, processes: int | None, process: int | None) -> None:
 
 
 def at_first(step: Callable[[], Any]) -> None:
-    """Has the first process make a step that comes before all others.
+    """Runs a step in the first process only; the other processes wait for it.
 
     Raises:
-      UserError: the step's; in every process, which so end alike.
+      UserError: the step failed; every process raises the same error.
     """
     if jax.process_count() == 1:
         step()
@@ -123,20 +123,20 @@ def at_first(step: Callable[[], Any]) -> None:
 
 
 def mesh(members: int) -> Mesh:
-    """As many of this process's devices as can have equal shares of the members."""
+    """The largest number of this process's devices that divides the members equally."""
     devices = jax.local_devices()
     number = next(n for n in range(len(devices), 0, -1) if members % n == 0)
     return Mesh(devices[:number], (_AXIS,))
 
 
 class Traces:
-    """How often functions were traced, which each of them is to be once."""
+    """Counts how often functions are traced; each should be traced once."""
 
     def __init__(self) -> None:
         self.count = 0
 
     def of(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, its traces counted."""
+        """The function, with its traces counted."""
 
         @functools.wraps(function)
         def counted(*arguments: Any) -> Any:
@@ -157,23 +157,23 @@ def compiled(
     mesh: Mesh,
     donate: tuple[int, ...] = (),
 ) -> Callable[..., Any]:
-    """A function of whole populations, to be compiled when it is first called.
+    """A function of whole populations, compiled at its first call.
 
-    Each device computes its own members and hears nothing of the others.
+    Each device computes its own members; devices do not communicate.
 
     Args:
-      function: takes and gives `[members]` on a leading axis.
-      axes: for each argument 0, or None where all members share it.
+      function: arguments and results have a leading axis `[members]`.
+      axes: for each argument 0, or None if all members share it.
       mesh: the devices.
-      donate: arguments whose memory the result may take.
+      donate: arguments whose memory the result may reuse.
     """
     shares = tuple(P() if axis is None else P(_AXIS) for axis in axes)
-    # Members vary over devices and counters do not: what loops carry is both.
+    # Members vary over devices and counters do not, and loops carry both.
     local = jax.shard_map(
         function, mesh=mesh, in_specs=shares, out_specs=P(_AXIS), check_vma=False
     )
-    # Said for one device, too: else its results and what `place` gives are two kinds of
-    # arguments, for which a function is traced twice.
+    # Needed for one device, too. Without it, a function's results and the arrays from
+    # `place` have different shardings, and a function is traced once for each.
     spread = NamedSharding(mesh, P(_AXIS))
     return jax.jit(local, donate_argnums=donate, out_shardings=spread)
 
@@ -184,5 +184,5 @@ def over(
     *axes: int | None,
     donate: tuple[int, ...] = (),
 ) -> Callable[..., Any]:
-    """A function of one member made one of whole populations, see `compiled`."""
+    """Turns a function of one member into one of populations, see `compiled`."""
     return compiled(jax.vmap(function, axes), axes, mesh, donate)

@@ -1,4 +1,4 @@
-"""The values a run starts from: the paper's, and a quick profile of them."""
+"""The settings of each profile, for a scenario and a method."""
 
 import dataclasses
 from typing import Literal, get_args
@@ -59,15 +59,17 @@ def _on_continual_world(scenario: Scenario) -> bool:
 def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     """The settings of a profile.
 
-    "paper" has the published budgets, widths and coefficients. Its one departure is
-    the evaluation: 512 episodes a task instead of 10 times as many, which leaves an
-    error of the mean far below the spread between seeds; 50 on Meta-World. "authors"
-    does as their code does where that differs from the text, its evaluations
-    included. "quick" ends within minutes on two cores: one round of the tasks, few
-    interactions, narrower layers.
+    - "paper" has the published budgets, widths and coefficients. It departs from the
+      paper only in the evaluation: 512 episodes of each task instead of 10 times as
+      many, and 50 on Meta-World. The error of the mean stays far below the spread
+      between seeds.
+    - "authors" follows the authors' code where it differs from the text, also in the
+      evaluation.
+    - "quick" takes minutes on two cores: one round of the tasks, few interactions,
+      narrower layers.
 
     Args:
-      scenario: what is to be learned.
+      scenario: the scenario.
       method: name of a method.
       profile: "paper", "authors" or "quick".
 
@@ -126,8 +128,8 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         selection_episodes=entry.selection_episodes or 4,
         report_every=2_560,
         checkpoint_every=12_800,
-        # A temperature that falls from 2 at the paper's rate would keep the policy
-        # random for longer than the whole profile.
+        # From 2, at the paper's rate, the temperature would stay so high that the
+        # policy is random for the whole profile.
         sac=dataclasses.replace(
             paper.sac,
             hidden=128,
@@ -138,7 +140,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
 
 
 def _continual_world(paper: Settings) -> Settings:
-    """One environment, 50 steps and then 50 updates, the first 1,000 at random."""
+    """One environment; 50 steps, then 50 updates; 1,000 random steps first."""
     start = min(1_000, paper.interactions // 4)
     paper = dataclasses.replace(
         paper,

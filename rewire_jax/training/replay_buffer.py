@@ -11,14 +11,13 @@ from rewire_jax.core.transition import Batch
 class Replay(NamedTuple):
     """Transitions of `envs` parallel environments, one row per time step.
 
-    The transition at time t lies in row t mod rows, and the observation that
-    follows it is the next row's. Only where an episode was cut off does the next
-    row hold something else (a fresh start): there, the true last observation is
-    kept in `final`. Two cuts in one environment are at least an episode's length
-    apart, so t // episode_length tells them apart.
+    The transition at time t is in row t mod rows. Its next observation is in the next
+    row. After the time limit cut an episode, the next row holds a fresh start instead;
+    then `final` holds the true last observation. Two cuts in one environment are at
+    least one episode length apart, so t // episode_length identifies a cut.
 
-    The time is the caller's, equal for all members of a population: that keeps the
-    writes in place under vmap.
+    The caller keeps the time. It is equal for all members of a population, so writes
+    stay in place under vmap.
 
     Attributes:
       observation: `[rows, envs, observations]`.
@@ -27,7 +26,7 @@ class Replay(NamedTuple):
       terminal: `[rows, envs]` bool, ended by the task.
       truncated: `[rows, envs]` bool, ended by the time limit.
       final: `[cuts, envs, observations]`.
-      extras: pytree of `[rows, envs, ...]`, what a method stores beside.
+      extras: pytree of `[rows, envs, ...]`, extra data of the method.
     """
 
     observation: jax.Array
@@ -51,11 +50,11 @@ def create(
 
     Args:
       first: `[envs, observations]`, the observations at time 0.
-      transitions: rows of transitions to hold; one more row is made, for the
-        observation after the last.
+      transitions: rows of transitions to hold; one more row holds the observation
+        after the last.
       actions: length of an action.
       episode_length: steps to a time limit.
-      extras: pytree of `[envs, ...]`, an example of what is stored beside.
+      extras: pytree of `[envs, ...]`, an example of the method's extra data.
     """
     envs, size = first.shape
     rows = transitions + 1
@@ -93,9 +92,9 @@ def add(
       reward: `[envs]`.
       terminal: `[envs]` bool.
       truncated: `[envs]` bool.
-      final_obs: `[envs, observations]`, what the step led to.
-      next_obs: `[envs, observations]`, the same but for ended episodes, where it
-        is the first observation of the next one.
+      final_obs: `[envs, observations]`, the observation that the step led to.
+      next_obs: `[envs, observations]`, the same; for an ended episode, the first
+        observation of the next one.
       episode_length: as in `create`.
       extras: as in `create`.
     """
@@ -120,7 +119,7 @@ def add(
 def sample_indices(
     replay: Replay, key: jax.Array, time: jax.Array, shape: tuple[int, ...]
 ) -> jax.Array:
-    """Places of transitions, uniform with replacement, as `take` takes them.
+    """Indices of transitions for `take`, uniform with replacement.
 
     Args:
       replay: the buffer.
@@ -134,7 +133,7 @@ def sample_indices(
 
 
 def extras_at(replay: Replay, indices: jax.Array, time: jax.Array) -> Any:
-    """What was stored beside the transitions at some indices, see `take`."""
+    """The method's extra data of the transitions at some indices, see `take`."""
     at, env = _find(replay, indices, time)
     row = at % len(replay.reward)
     return jax.tree.map(lambda a: a[row, env], replay.extras)
@@ -143,7 +142,7 @@ def extras_at(replay: Replay, indices: jax.Array, time: jax.Array) -> Any:
 def take(
     replay: Replay, indices: jax.Array, time: jax.Array, episode_length: int
 ) -> Batch:
-    """The transitions at some indices, counted from the latest back.
+    """The transitions at some indices; index 0 is in the latest step.
 
     Args:
       replay: the buffer.

@@ -1,4 +1,4 @@
-"""Acting in environments: training steps with fresh starts, and whole episodes."""
+"""Steps environments: single steps of training, and whole episodes."""
 
 import functools
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from rewire_jax.methods.base import axes
 
 
 class Success(NamedTuple):
-    """Whether a task is solved, by the two rules in use, or how often it was.
+    """Success by two rules, as bools or as counts.
 
     Attributes:
-      any: at any step of the episode so far (Continual World's rule).
-      last: at the latest step (that of the paper's authors).
+      any: solved at any step of the episode so far (Continual World's rule).
+      last: solved at the latest step (the rule of the paper's authors).
     """
 
     any: jax.Array
@@ -24,7 +24,7 @@ class Success(NamedTuple):
 
 
 def named(success: Any) -> dict[str, Any]:
-    """The parts of a `Success` by their names in result files; none of `()`."""
+    """The parts of a `Success` by their names in result files; empty for `()`."""
     return {"success": success.any, "success_last": success.last} if success else {}
 
 
@@ -32,11 +32,11 @@ class Episode(NamedTuple):
     """One environment in training.
 
     Attributes:
-      state: its current state.
-      start: the state that the next episode starts from.
-      steps: `[]` int32, of the current episode.
+      state: the current state.
+      start: the first state of the next episode.
+      steps: `[]` int32, steps of the current episode.
       score: `[]`, return of the current episode so far.
-      success: `Success` of `[]` bool in it; `()` where none is known.
+      success: `Success` of `[]` bool in it; `()` if not defined.
     """
 
     state: State
@@ -47,16 +47,16 @@ class Episode(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What one environment step gave.
+    """The result of one environment step.
 
     Attributes:
       reward: `[]`.
       terminal: `[]` bool, ended by the task.
       truncated: `[]` bool, ended by the time limit alone.
-      final_obs: `[observations]`, what the step led to.
-      next_obs: `[observations]`, the same or a fresh start's.
+      final_obs: `[observations]`, the observation that the step led to.
+      next_obs: `[observations]`, the same; after an ended episode, the fresh start's.
       score: `[]`, return of the episode so far.
-      success: `Success` of `[]` bool in it; `()` where none is known.
+      success: `Success` of `[]` bool in it; `()` if not defined.
     """
 
     reward: jax.Array
@@ -74,7 +74,7 @@ class Rollout(NamedTuple):
     Attributes:
       returns: undiscounted.
       lengths: in steps.
-      success: `Success` of bools; `()` where none is known.
+      success: `Success` of bools; `()` if not defined.
     """
 
     returns: jax.Array
@@ -83,16 +83,16 @@ class Rollout(NamedTuple):
 
 
 def no_success(environment: Environment | HostEnvironment, shape: Any = ()) -> Any:
-    """`Success` before an episode's first step; `()` where none is known."""
+    """`Success` before an episode's first step; `()` if not defined."""
     none = jnp.zeros(shape, bool)
     return Success(none, none) if environment.success else ()
 
 
 def succeed(before: Any, now: Any) -> Any:
-    """`Success` after a step; `()` where none is known.
+    """`Success` after a step; `()` if not defined.
 
     Args:
-      before: of the episode, before the step.
+      before: the episode's, before the step.
       now: bool, `State.success`.
     """
     return Success(before.any | now, now) if before else ()
@@ -108,10 +108,10 @@ def begin(environment: Environment, task: Task, key: jax.Array) -> Episode:
 def advance(
     environment: Environment, task: Task, episode: Episode, action: jax.Array
 ) -> tuple[Episode, Step]:
-    """Steps one environment; an ended episode goes to the stored start.
+    """Steps one environment; an ended episode goes back to the stored start.
 
-    A stored start, as in brax's wrapper, saves a reset in every step; the starts
-    differ between environments and tasks.
+    A stored start, as in brax's wrapper, avoids a reset in every step. Each environment
+    has its own start in each task.
     """
     state = environment.step(task, episode.state, action)
     steps = episode.steps + 1
@@ -202,10 +202,10 @@ def since_reset(
     keys: jax.Array,
     count: int,
 ) -> Rollout:
-    """Plays one step less than an episode has, whatever ends on the way.
+    """Plays one step less than an episode has, and does not stop at a terminal state.
 
-    What ends goes back to its start. The return is that since then, as the authors'
-    CSP judges its candidates. Arguments and result are those of `episodes`.
+    An ended episode goes back to its start. The return counts from the latest start, as
+    for the candidates of the authors' CSP. Arguments and result are as in `episodes`.
     """
     over = functools.partial(_over, policies)
     steps = environment.episode_length - 1
@@ -228,18 +228,18 @@ def since_reset(
 
 
 PLAYS = {"episode": episodes, "since_reset": since_reset}
-"""How candidates are played, by `Method.candidate_score`."""
+"""The function that plays candidates, for each `Method.candidate_score`."""
 
 
 def _over(policies: Any, function: Callable[..., Any]) -> Callable[..., Any]:
     """Maps over members, rows and episodes.
 
-    A task is shared by members, a policy by episodes.
+    Members share a task; episodes share a policy.
     """
     function = jax.vmap(function, (None, None, 0))
     return jax.vmap(jax.vmap(function, (0, axes(policies), 0)), (None, 0, 0))
 
 
 def _split(keys: jax.Array, count: int) -> jax.Array:
-    """Keys `[members, rows, count]` of episodes."""
+    """Keys `[members, rows, count]`, one for each episode."""
     return jax.vmap(jax.vmap(lambda key: jax.random.split(key, count)))(keys)

@@ -5,15 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import rewire_jax
 from docs import drawings
 from rewire_jax.cli import main
-from rewire_jax.envs import scenarios
 from rewire_jax.methods import METHODS
 from tests.tiny import tiny
 
@@ -33,7 +29,7 @@ def site(tmp_path_factory):
         cwd=folder,
     )
     assert built.returncode == 0, built.stderr
-    return {path.stem: path.read_text() for path in out.glob("*.html")}
+    return {path.stem: path.read_text() for path in out.rglob("*.html")}
 
 
 def codes(page):
@@ -88,6 +84,12 @@ def test_committed_results_are_shown(site) -> None:
     assert "made:" not in "".join(site.values())
 
 
+def test_notebooks_are_shown_with_their_outputs(site) -> None:
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        assert 'class="cell_output' in site[path.stem]
+        assert f"{path.name}" in site["notebooks"]
+
+
 def test_nothing_is_fetched_to_read_it(site) -> None:
     for page in site.values():
         assert not re.findall(r"<(?:script|link|img)[^>]*=\"(?:https?:)?//", page)
@@ -100,23 +102,8 @@ def test_drawings_are_the_same_each_time(tmp_path: Path) -> None:
         assert one.read_bytes() == other.read_bytes()
 
 
-def test_a_domain_of_ones_own_is_learned_and_its_files_are_told(
-    site, tmp_path: Path, monkeypatch
-) -> None:
-    monkeypatch.setattr(scenarios, "DOMAINS", scenarios.DOMAINS.copy())
-    monkeypatch.setattr(scenarios, "SCENARIOS", scenarios.SCENARIOS.copy())
-    from docs.examples import corridor
-
-    scenario = rewire_jax.make_scenario("corridor/ends")
-    task = scenario.tasks[2].data
-    state = scenario.environment.reset(task, jax.random.key(0))
-    moved = scenario.environment.step(task, state, jnp.ones(1))
-    expected = np.clip(state.inner - corridor.STRIDE, -1, 1)
-    np.testing.assert_allclose(moved.observation, expected, rtol=1e-6)
-    np.testing.assert_allclose(moved.reward, -abs(0.8 - expected[0]), rtol=1e-6)
-
-    settings = dataclasses.replace(tiny(scenario), tasks=1, seeds=1)
-    folder = rewire_jax.train(settings, tmp_path / "run", scenario=scenario)
+def test_the_files_of_a_run_are_told(site, tmp_path: Path) -> None:
+    folder = rewire_jax.train(dataclasses.replace(tiny(), seeds=1), tmp_path / "run")
     known = codes(site["files"])
     files = {path.name for path in folder.iterdir()}
     assert {name.replace("checkpoints", "checkpoints/") for name in files} <= known
@@ -124,19 +111,3 @@ def test_a_domain_of_ones_own_is_learned_and_its_files_are_told(
     for table in folder.glob("*.jsonl"):
         told |= set(json.loads(table.read_text().splitlines()[-1]))
     assert {"alignment", "model_size", "compile"} <= told <= known
-
-
-@pytest.mark.slow
-def test_the_question_of_the_quick_start_is_answered(
-    tmp_path: Path, monkeypatch
-) -> None:
-    from docs.examples import limping
-
-    scale = rewire_jax.make_scenario(limping.SPEC).tasks[1].action_scale
-    assert sorted(scale) == [0, 0, 1, 1, 1, 1, 1, 1]
-    # The rest of it where nothing takes minutes.
-    monkeypatch.setattr(limping, "SPEC", "probe/reach")
-    small = {"tasks": 2, "interactions": 640, "warmup": 160, "eval_episodes": 4}
-    for _ in range(2):  # What is finished stays.
-        report = limping.compare(tmp_path, **small)
-    assert all(label in report.read_text() for label in ("rewire", "FT-1", "SAC-N"))

@@ -6,7 +6,6 @@ import pytest
 from experiments import readme
 from experiments.readme import fill
 from rewire_jax.core.errors import UserError
-from tests.tiny import tiny
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
@@ -94,32 +93,3 @@ def test_links_of_the_readme_lead_somewhere() -> None:
                 re.sub(r"[^\w\s-]", "", h).lower().replace(" ", "-") for h in heads
             ]
             assert anchor[0] in slugs
-
-
-def test_the_readmes_own_scenario_and_method_work(tmp_path: Path) -> None:
-    import dataclasses
-
-    import jax.numpy as jnp
-
-    import rewire_jax
-    from rewire_jax import methods
-
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
-    own = next(block for block in blocks if "ScenarioSpec(" in block)
-    names: dict = {}
-    # All but the run's policy and the training, which takes minutes.
-    lines = [line for line in own.splitlines() if "policy" not in line]
-    exec("\n".join(lines).split("\ntrain(")[0], names)
-    assert list(names["scenario"].tasks[0].action_scale).count(0) == 1
-    assert names["settings"].interactions == 5_120
-    blocks = re.findall(
-        r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
-    )
-    exec(next(block for block in blocks if "def shrink" in block), {})
-    try:
-        settings = dataclasses.replace(tiny(method="shrink"), tasks=2)
-        rewire_jax.train(settings, tmp_path / "run")
-        policy = rewire_jax.load_policy(tmp_path / "run", task=1)
-        assert policy(jnp.zeros(2)).shape == (2,)
-    finally:
-        del methods.METHODS["shrink"]

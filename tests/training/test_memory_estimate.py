@@ -187,7 +187,7 @@ def test_as_many_members_as_the_devices_hold():
     assert memory_estimate.fitting(need, devices(2, bytes_limit=limit)) == 6
     with pytest.raises(UserError, match=r"a member needs .* lower --buffer"):
         memory_estimate.fitting(need, devices(1, bytes_limit=total))
-    with pytest.raises(UserError, match="give --members-per-batch"):
+    with pytest.raises(UserError, match="--members-per-batch"):
         memory_estimate.fitting(need, devices(1))
 
 
