@@ -24,9 +24,9 @@ from rewire_jax.core.settings import Settings, require
 from rewire_jax.envs.scenarios import list_scenarios, make_scenario
 from rewire_jax.methods import METHODS
 from rewire_jax.rendering import render
-from rewire_jax.reports import run_report, sweep_report
+from rewire_jax.reports.report import to_terminal
+from rewire_jax.reports.write import write_report
 from rewire_jax.run import evaluation, interrupts, sweep, train_run
-from rewire_jax.storage import run_folder
 from rewire_jax.storage.scores import Success
 from rewire_jax.training import population
 from rewire_jax.version import __version__
@@ -212,11 +212,7 @@ def _sweep(arguments: Sequence[str]) -> None:
         log=asked.log,
     )
     if jax.process_index() == 0:
-        _show(sweep_report.write_sweep_report(folder))
-
-
-def _show(written: sweep_report.SweepReport) -> None:
-    print(written.title, *written.notes, *written.paths, sep="\n")
+        print(to_terminal(write_report([folder], folder)), end="")
 
 
 def _evaluate(arguments: Sequence[str]) -> None:
@@ -247,14 +243,10 @@ def _render(arguments: Sequence[str]) -> None:
 
 def _report(arguments: Sequence[str]) -> None:
     asked = parse(Report, "report", arguments)
-    if "sweep" in map(run_folder.kind, asked.runs):
-        require(len(asked.runs) == 1, "a sweep is reported on alone")
-        _show(sweep_report.write_sweep_report(asked.runs[0], asked.out))
-        return
-    made = run_report.write_report(
+    made = write_report(
         asked.runs, asked.out, single=asked.single, success=asked.success
     )
-    print(run_report.to_terminal(made), end="")
+    print(to_terminal(made), end="")
 
 
 def _info(arguments: Sequence[str]) -> None:
