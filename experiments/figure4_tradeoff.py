@@ -7,7 +7,7 @@ wider. Widths are the paper's 175 and 384 of 256, scaled to the profile's networ
 from dataclasses import dataclass
 
 import rewire_jax
-from experiments import suite
+from experiments import averages, suite
 from rewire_jax.reports import paper_results
 from rewire_jax.reports.tradeoff_plot import Point, tradeoff
 
@@ -45,18 +45,19 @@ def run(job: Figure4) -> None:
     out = job.folder("figure4")
     runs = [r for name in job.scenarios for r in job.runs(name, variants(job, name))]
     reports = suite.reports(suite.train(runs, job), out)
-    found = suite.averages(reports)
+    found = averages.over_scenarios(reports)
     labels = paper_results.NAMES | {label.lower(): label for label in SIZED}
     table, rows, points = [["method", "performance", "model size"]], [], []
     for name, label in labels.items():
         ours = found.get(name)
-        table.append([label, suite.text(ours, len(job.scenarios)), suite.size(ours)])
-        rows.append({"method": label} | suite.columns("", ours))
+        shown = averages.text(ours, len(job.scenarios))
+        table.append([label, shown, averages.size(ours)])
+        rows.append({"method": label} | averages.columns("", ours))
         if ours:
             points.append(Point(label, ours.size, ours.mean, ours.std))
     title = f"Figure 4, {', '.join(job.scenarios)}, {job.profile} profile"
     picture = out / "figure4.png"
-    notes = (f"![{title}]({picture.name})", "", suite.READING, "")
+    notes = (f"![{title}]({picture.name})", "", averages.READING, "")
     suite.write(out / "figure4", title, table, (*notes, *suite.origins(reports)), rows)
     tradeoff(points, "÷ SAC-N", title, picture)
     print(picture)

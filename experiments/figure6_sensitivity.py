@@ -69,8 +69,8 @@ def run(job: Figure6) -> None:
             resume=made.started,
         )
     out = job.folder(f"{what}-{job.scenario}")
-    report = rewire_jax.write_sweep_report(folder, out)
-    print(report.markdown.read_text(encoding="utf-8"))
+    report = rewire_jax.write_report([folder], out)
+    print(report.page.read_text(encoding="utf-8"))
     print(*report.paths, sep="\n")
 
 

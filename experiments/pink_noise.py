@@ -6,8 +6,7 @@ to one side for longer.
 
 from experiments import first_task, suite
 from experiments.first_task import FirstTask, Trained
-from rewire_jax.reports import run_tables
-from rewire_jax.reports.run_summary import spread
+from rewire_jax.reports.spread import spread
 
 # Two of the runs are Figure 5's.
 VARIANTS: suite.Variants = {
@@ -20,8 +19,7 @@ LABELS = {"ft1": "FT-1", "ft1-pink": "FT-1, pink noise", "rewire": "Ours"}
 
 def tell(trained: Trained) -> str:
     """Evaluations after the first task, in Markdown."""
-    returns = run_tables.spread(spread(trained.returns))
-    return f"- {trained.curve.label}: **{returns}**"
+    return f"- {trained.curve.label}: **{spread(trained.returns)}**"
 
 
 def run(job: FirstTask) -> None:

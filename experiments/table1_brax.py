@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from experiments import paper_table, suite
+from experiments import averages, paper_table, suite
 
 SCENARIOS = tuple(name for names in suite.DOMAINS.values() for name in names)
 
@@ -33,7 +33,7 @@ def run(job: Table1) -> None:
         job.runs_of(domains, always=("sac_n",)),
         "domain",
         f"Table 1, {job.profile} profile",
-        suite.READING,
+        averages.READING,
         job.folder("table1") / "table1",
     )
 

@@ -6,7 +6,7 @@ sequences on Meta-World v3, the paper's are on v1.
 
 from dataclasses import dataclass
 
-from experiments import paper_table, suite
+from experiments import averages, paper_table, suite
 from rewire_jax.core.settings import require
 from rewire_jax.reports import paper_results
 from rewire_jax.storage.scores import SUCCESS, Success
@@ -53,7 +53,7 @@ def run(job: Table2) -> None:
     (paper,) = paper_results.sources(CW10)
     reading = (
         f"Performance is the {score.noun}, averaged over tasks after the last of them; "
-        f"{suite.AVERAGED} {score.evaluated} The paper's results are {paper.made}."
+        f"{averages.AVERAGED} {score.evaluated} The paper's results are {paper.made}."
     )
     out = job.folder("table2" if job.success == "any" else "table2-last")
     paper_table.write(

@@ -25,7 +25,7 @@ from experiments.faults import (
 )
 from experiments.faults.base import Impossible, Kind
 from rewire_jax.core.settings import require
-from rewire_jax.reports.run_tables import markdown
+from rewire_jax.reports.table import to_markdown
 from rewire_jax.storage import run_folder
 
 KINDS: dict[str, Kind] = {
@@ -96,7 +96,7 @@ def report(found: Mapping[str, Any]) -> str:
     for name in filter(KINDS.__contains__, found):
         how = found[name]["provenance"]
         origins += [f"- {name}: {how['device']}, commit `{how['commit']}`"]
-    table = markdown(head, lines)
+    table = to_markdown(head, lines)
     return "\n".join(["# Faults", "", *table, READING, "", *origins]) + "\n"
 
 

@@ -29,7 +29,7 @@ def compare(out: Path, profile: str = "quick", **changes: Any) -> Path:
         run = out / method
         rewire_jax.train(settings, run, scenario=scenario, resume=run.exists())
         runs.append(run)
-    return rewire_jax.write_report(runs, out / "report").markdown
+    return rewire_jax.write_report(runs, out / "report").page
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 from matplotlib.axes import Axes
 
 from experiments import population
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
+from experiments.suite import Row, show
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.reports import plots
 from rewire_jax.training.presets import preset
@@ -48,7 +49,7 @@ PART = Part(
     "and memory.",
     measure=measure,
     columns={
-        "members": show("members", "d"),
+        "members": show("members"),
         "updates a second, all together": show("updates_per_second", ",.0f"),
         "gain over the first": show("gain", ".2f"),
         "compile, s": show("compile_seconds", ".0f"),

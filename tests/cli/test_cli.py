@@ -175,7 +175,7 @@ def test_reports_that_cannot_be(
 ) -> None:
     assert "name the folder" in fails(capsys, "report")
     assert "given twice" in fails(capsys, "report", run, run)
-    assert "not the folder of a run" in fails(capsys, "report", tmp_path)
+    assert "holds no run" in fails(capsys, "report", tmp_path)
     assert "--oot" in fails(capsys, "report", run, "--oot", tmp_path)
     (tmp_path / "file").touch()
     assert "cannot write" in fails(capsys, "report", run, "--out", tmp_path / "file")
