@@ -9,13 +9,13 @@ from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import Comparison, Summary
 
 AVERAGED = (
-    "that of several scenarios is the mean over them, of means and of standard "
-    "deviations over seeds. Runs that are not finished have no part in it. Model size "
-    "is in plain policies."
+    "Over several scenarios, means and standard deviations over seeds are averaged. "
+    "Unfinished runs are left out. Model size is in plain policies."
 )
 READING = (
-    "Performance is the return at the end, averaged over tasks, divided by that of "
-    f"SAC-N; {AVERAGED} The paper's results were made on Brax v1 (`--backend v1`)."
+    "Performance is the return after the last task, averaged over tasks and divided by "
+    f"that of SAC-N. {AVERAGED} The paper's results were made on Brax v1 "
+    "(`--backend v1`)."
 )
 
 

@@ -3,8 +3,6 @@
 Run by `make bench-mjx`. Rates are those of the best round; actions are random.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import jax
 
 from experiments import suite
+from experiments.speed.timing import timed
 from rewire_jax.envs.base import Environment, TaskChange
 from rewire_jax.envs.metaworld import make_domain
 
@@ -43,17 +42,6 @@ class BenchMjx:
     out: Path | None = None
 
 
-def timed(rounds: int, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-    """What a function gives, and the seconds of each of some further calls."""
-    result = jax.block_until_ready(function(*arguments))
-    seconds = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        seconds.append(time.perf_counter() - start)
-    return [result, *seconds]
-
-
 def measure(job: BenchMjx, count: int) -> list[dict[str, Any]]:
     """Times resets and steps of one number of environments, on each task."""
     domain = make_domain("mjx", "v2", job.tasks)
@@ -78,8 +66,10 @@ def measure(job: BenchMjx, count: int) -> list[dict[str, Any]]:
     rows = []
     for name in job.tasks:
         task = domain.make_task(TaskChange(name, extra={"task": name}))
-        state, *resets = timed(job.rounds, reset, task, keys)
-        _, *plays = timed(job.rounds, play, task, state, keys[0])
+        state = reset(task, keys)
+        resets = [timed(reset, task, keys) for _ in range(job.rounds)]
+        timed(play, task, state, keys[0])  # compiles
+        plays = [timed(play, task, state, keys[0]) for _ in range(job.rounds)]
         rows.append(
             {
                 "task": name,

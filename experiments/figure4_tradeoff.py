@@ -36,12 +36,7 @@ def variants(job: Figure4, name: str) -> suite.Variants:
 
 
 def run(job: Figure4) -> None:
-    """Trains what is not finished, and writes a report a scenario and the figure.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
     out = job.folder("figure4")
     runs = [r for name in job.scenarios for r in job.runs(name, variants(job, name))]
     reports = suite.reports(suite.train(runs, job), out)

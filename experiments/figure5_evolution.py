@@ -146,15 +146,8 @@ def notes(found: dict[str, Trained]) -> Sequence[str]:
 
 
 def run(job: FirstTask) -> None:
-    """Trains what is not finished, and draws the figure.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
-    runs = job.first_runs(VARIANTS)
-    suite.train(runs, job)
-    evolved = first_task.read("Figure 5", runs, LABELS)
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
+    evolved = first_task.train(job, "Figure 5", VARIANTS, LABELS)
     path = job.folder("figure5") / "figure5"
     found = evolved.found
     first_task.write(

@@ -49,12 +49,7 @@ def configurations(job: Figure6, options: Any) -> list[dict[str, float]]:
 
 
 def run(job: Figure6) -> None:
-    """Trains what is not finished, and writes the figure and its numbers.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and draws the figure; raises as `suite.train`."""
     scenario = job.scenario_of(job.scenario)
     what = "figure6-grid" if job.full else "figure6-lines"
     folder = job.out / job.name(job.scenario) / what

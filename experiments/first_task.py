@@ -22,9 +22,9 @@ from rewire_jax.reports.training_curve_plot import Curve, evolution
 from rewire_jax.storage.run_results import RunData, read_progress, read_run
 
 READING = (
-    "Over seeds; those that diverged have no part in it, nor have runs that are not "
-    "finished. The end is the time of the last whole episode: all environments begin "
-    "theirs together, so each part of an episode counts once."
+    "Values are over seeds. Diverged seeds and unfinished runs are left out. The end "
+    "is the last whole episode: all environments start their episodes together, so "
+    "each part of an episode counts once."
 )
 _EPISODES = 128
 _REPORT, _CHECKPOINT = 12_800, 100_000
@@ -124,6 +124,19 @@ class Evolution(NamedTuple):
     title: str
     found: dict[str, Trained]
     origins: list[str]
+
+
+def train(
+    job: FirstTask,
+    subject: str,
+    variants: suite.Variants,
+    labels: Mapping[str, str],
+    value: str | None = None,
+) -> Evolution:
+    """Trains what is unfinished, and reads it; raises as `suite.train` and `read`."""
+    runs = job.first_runs(variants)
+    suite.train(runs, job)
+    return read(subject, runs, labels, value)
 
 
 def read(

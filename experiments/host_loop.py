@@ -7,8 +7,6 @@ times, so that what slows the machine for longer does not count, and medians of 
 
 import dataclasses
 import itertools
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 
 import rewire_jax
 from experiments import suite
+from experiments.speed.timing import timed
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.envs.vector_env import VectorEnv
@@ -102,13 +101,6 @@ def simulate(lanes: VectorEnv, environment: HostEnvironment, steps: int) -> None
             lanes.reset(0, draw.integers(2**31, size=count))
         size = (count, environment.action_size)
         lanes.step(draw.uniform(-1, 1, size).astype(np.float32))
-
-
-def timed(function: Callable[..., Any], *arguments: Any) -> float:
-    """Seconds."""
-    began = time.perf_counter()
-    function(*arguments)
-    return time.perf_counter() - began
 
 
 def measure(job: HostLoop, method: str, width: int) -> dict[str, Any]:

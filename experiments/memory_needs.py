@@ -19,13 +19,12 @@ from rewire_jax.training.run_setup import prepare
 SCENARIOS = ("halfcheetah/forgetting", "continual_world/t3")
 TITLE = "Memory of a member, in MB"
 READING = (
-    "Counted for the paper profile before anything is compiled: what learning changes, "
-    "the replay buffer, the environments, what is taken for a while beside these in "
-    "training, and beside the learner alone in an evaluation. The most at a time is "
-    "the learner with the larger of training and evaluation. Environments that are "
-    "stepped on the host take nothing of the device."
+    "Counted for the paper profile before anything is compiled: the learner, the "
+    "replay buffer, the environments, temporary arrays of training (work), and "
+    "temporary arrays of an evaluation. The total is the learner and the larger of "
+    "training and evaluation. Environments that are stepped on the host take no memory "
+    "of the device."
 )
-
 COLUMNS = {
     "scenario": suite.show("scenario"),
     "method": lambda row: NAMES[row["method"]],

@@ -23,15 +23,8 @@ def tell(trained: Trained) -> str:
 
 
 def run(job: FirstTask) -> None:
-    """Trains what is not finished, and draws the curves.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
-    runs = job.first_runs(VARIANTS)
-    suite.train(runs, job)
-    evolved = first_task.read("Pink noise", runs, LABELS)
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
+    evolved = first_task.train(job, "Pink noise", VARIANTS, LABELS)
     notes = (
         "Training returns are those of exploring actions. Evaluated without noise "
         "after the task, mean ± sample standard deviation over seeds:",

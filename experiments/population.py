@@ -169,10 +169,7 @@ def draw(rows: Sequence[Mapping[str, Any]], key: str, path: Path) -> None:
     """Writes the picture: time per member against members."""
     figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
     members = [row["members"] for row in rows]
-    times = [1e3 * row[key] for row in rows]
-    axes.plot(members, times, marker="o", **plots.look(0))
-    plots.doubling(axes, members)
-    axes.set_ylim(0, 1.1 * max(times))
+    plots.by_size(axes, members, [1e3 * row[key] for row in rows])
     axes.set_xlabel("members side by side")
     axes.set_ylabel("ms a member and interaction")
     axes.grid(color="0.9")

@@ -21,12 +21,7 @@ class Table1(paper_table.Table):
 
 
 def run(job: Table1) -> None:
-    """Trains what is not finished, and writes a report a scenario and the table.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and writes the table; raises as `suite.train`."""
     domains = {name: name.split("/")[0] for name in job.scenarios}
     paper_table.write(
         job,

@@ -52,12 +52,7 @@ def variants(job: Table3) -> suite.Variants:
 
 
 def run(job: Table3) -> None:
-    """Trains what is not finished, and writes the report and the table.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and writes the table; raises as `suite.train`."""
     out = job.folder("table3")
     runs = suite.train(job.runs(job.scenario, variants(job)), job)
     reports = suite.reports(runs, out)

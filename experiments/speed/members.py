@@ -32,10 +32,7 @@ def measure(effort: Effort) -> list[Row]:
 def draw(axes: Axes, rows: list[Row]) -> None:
     """Updates a second of all members together."""
     members = [row["members"] for row in rows]
-    rates = [row["updates_per_second"] for row in rows]
-    axes.plot(members, rates, marker="o", **plots.look(0))
-    plots.doubling(axes, members)
-    axes.set_ylim(0, None)
+    plots.by_size(axes, members, [row["updates_per_second"] for row in rows])
     axes.set_xlabel("members side by side")
     axes.set_ylabel("updates a second, all together")
 

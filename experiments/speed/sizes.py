@@ -43,12 +43,9 @@ def measure(effort: Effort) -> list[Row]:
 def draw(axes: Axes, rows: list[Row]) -> None:
     """Cost by width, at one number of modes."""
     rows = [row for row in rows if row["modes"] == rows[-1]["modes"]]
-    rows.sort(key=show("hidden"))
+    rows.sort(key=lambda row: row["hidden"])
     widths = [row["hidden"] for row in rows]
-    costs = [row["cost"] for row in rows]
-    axes.plot(widths, costs, marker="o", **plots.look(0))
-    plots.doubling(axes, widths)
-    axes.set_ylim(0, None)
+    plots.by_size(axes, widths, [row["cost"] for row in rows])
     axes.set_xlabel("neurons in a hidden layer")
     axes.set_ylabel("cost of a rewire update, in plain ones")
 

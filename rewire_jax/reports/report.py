@@ -4,7 +4,7 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 from rich.console import Console
 from rich.text import Text
@@ -13,13 +13,6 @@ from rewire_jax.core.errors import writing
 from rewire_jax.reports.table import Table, to_markdown, to_rich
 
 Numbers = TypeVar("Numbers", covariant=True)
-
-
-class Picture(NamedTuple):
-    """A picture's title, and what draws it into a file."""
-
-    title: str
-    draw: Callable[[Path], None]
 
 
 @dataclass(frozen=True)
@@ -36,7 +29,8 @@ class Report(Generic[Numbers]):
         shown: tables for a terminal, which shows the end best.
         reading: how to read the tables.
         texts: files of numbers by name.
-        pictures: by the name of their file.
+        pictures: their titles, by name of the file.
+        draw: draws them into a folder.
         details: lines of Markdown below the pictures.
         origins: a line of Markdown for each result.
     """
@@ -50,7 +44,8 @@ class Report(Generic[Numbers]):
     shown: tuple[Table, ...]
     reading: tuple[str, ...]
     texts: dict[str, str]
-    pictures: dict[str, Picture]
+    pictures: dict[str, str]
+    draw: Callable[[Path], None]
     details: list[str]
     origins: list[str]
 
@@ -75,12 +70,11 @@ class Report(Generic[Numbers]):
             self.folder.mkdir(parents=True, exist_ok=True)
             for name, text in {self.name: self._markdown(), **self.texts}.items():
                 (self.folder / name).write_text(text, encoding="utf-8")
-            for name, picture in self.pictures.items():
-                picture.draw(self.folder / name)
+            self.draw(self.folder)
 
     def _markdown(self) -> str:
         notes = (f"**{note}**" for note in self.notes)
-        shown = (f"![{each.title}]({name})" for name, each in self.pictures.items())
+        shown = (f"![{title}]({name})" for name, title in self.pictures.items())
         lines = [f"# {self.title}", *notes, "\n".join(to_markdown(*self.table)[:-1])]
         lines += [*self.reading, *shown]
         parts = [line for each in lines for line in (each, "")]

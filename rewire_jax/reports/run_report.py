@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ import numpy as np
 from rewire_jax.reports import run_tables
 from rewire_jax.reports.data_files import json_text
 from rewire_jax.reports.provenance import origin
-from rewire_jax.reports.report import Picture, Report
+from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import MEASURES, Comparison, Summary, Tasks
 from rewire_jax.reports.table import Table, to_markdown
-from rewire_jax.reports.titles import heading
+from rewire_jax.reports.titles import heading, several
 from rewire_jax.storage.run_results import RunData
 
 _READING = (
@@ -69,7 +70,12 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
             "tasks.csv": run_tables.tasks_csv(comparison),
             "result.json": _json(comparison, title, notes),
         },
-        pictures=_pictures(comparison, title),
+        pictures={
+            "tradeoff.png": "Performance and model size",
+            "curves.png": "Learning curves",
+            "matrix.png": "Matrix",
+        },
+        draw=partial(_draw, comparison, title),
         details=to_markdown(*tasks),
         origins=[
             *(origin(each.label, each.run) for each in comparison.summaries),
@@ -105,11 +111,9 @@ def _notes(comparison: Comparison) -> Iterator[str]:
     for summary in comparison.summaries:
         run = summary.run
         if run.diverged:
-            names = ", ".join(str(seed) for seed in run.diverged)
-            some = f"seed {names} diverged and is"
-            if len(run.diverged) > 1:
-                some = f"seeds {names} diverged and are"
-            yield f"{summary.label}: {some} left out of all means and pictures."
+            lost = several(len(run.diverged), "diverged seed")
+            names = ", ".join(map(str, run.diverged))
+            yield f"{summary.label}: {lost} left out of means and pictures: {names}."
         if not run.complete:
             end = "there are no results after training yet"
             if run.finished:
@@ -117,52 +121,27 @@ def _notes(comparison: Comparison) -> Iterator[str]:
                     f'"{MEASURES["end"]}" is after task {run.finished}, and means are '
                     "over the tasks trained by then"
                 )
-            done = f"{run.finished} of {len(run.tasks)} tasks"
+            done = f"{run.finished} of {several(len(run.tasks), 'task')}"
             yield f"{summary.label}: unfinished, {done}; {end}."
 
 
-def _pictures(comparison: Comparison, title: str) -> dict[str, Picture]:
-    first, score = comparison.summaries[0].run, comparison.score
+def _draw(comparison: Comparison, title: str, folder: Path) -> None:
+    # Here, because Matplotlib takes long to import.
+    from rewire_jax.reports import plots
+    from rewire_jax.reports.tradeoff_plot import Point, tradeoff
 
-    def tradeoff(path: Path) -> None:
-        # Here, because Matplotlib takes long to import.
-        from rewire_jax.reports import tradeoff_plot
-
-        points = []
-        for summary in comparison.summaries:
-            value = summary.performance
-            mean = math.nan if value.mean is None else value.mean
-            size = summary.run.model_size
-            points.append(tradeoff_plot.Point(summary.label, size, mean, value.std))
-        tradeoff_plot.tradeoff(points, comparison.unit, title, path)
-
-    def lines() -> list[Any]:
-        from rewire_jax.reports import plots
-
-        made = []
-        for summary in comparison.summaries:
-            run, kept = summary.run, summary.run.kept
-            scores = np.concatenate([run.before[:, None], run.scores], axis=1)
-            curve = [(x, values[kept]) for x, values in run.curve]
-            made.append(plots.Line(summary.label, curve, scores[kept]))
-        return made
-
-    def curves(path: Path) -> None:
-        from rewire_jax.reports import plots
-
-        budget = int(first.settings["interactions"])
-        plots.curves(lines(), first.tasks, budget, score, title, path)
-
-    def matrix(path: Path) -> None:
-        from rewire_jax.reports import plots
-
-        plots.matrices(lines(), first.tasks, score, title, path)
-
-    return {
-        "tradeoff.png": Picture("Performance and model size", tradeoff),
-        "curves.png": Picture("Learning curves", curves),
-        "matrix.png": Picture("Matrix", matrix),
-    }
+    lines, points = [], []
+    for summary in comparison.summaries:
+        run, kept, value = summary.run, summary.run.kept, summary.performance
+        scores = np.concatenate([run.before[:, None], run.scores], axis=1)
+        curve = [(x, values[kept]) for x, values in run.curve]
+        lines.append(plots.Line(summary.label, curve, scores[kept]))
+        mean = math.nan if value.mean is None else value.mean
+        points.append(Point(summary.label, run.model_size, mean, value.std))
+    score, budget = comparison.score, int(run.settings["interactions"])
+    tradeoff(points, comparison.unit, title, folder / "tradeoff.png")
+    plots.curves(lines, run.tasks, budget, score, title, folder / "curves.png")
+    plots.matrices(lines, run.tasks, score, title, folder / "matrix.png")
 
 
 def _json(comparison: Comparison, title: str, notes: tuple[str, ...]) -> str:

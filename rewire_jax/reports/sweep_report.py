@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from rewire_jax.reports import sweep_tables
 from rewire_jax.reports.data_files import json_text
 from rewire_jax.reports.provenance import origin
-from rewire_jax.reports.report import Picture, Report
+from rewire_jax.reports.report import Report
 from rewire_jax.reports.sweep_summary import Configuration, Panel, SweepSummary
 from rewire_jax.reports.sweep_tables import UNIT, settings_text
 from rewire_jax.reports.table import to_markdown
@@ -37,10 +38,6 @@ def make(summary: SweepSummary, folder: Path) -> Report[SweepSummary]:
     """
     title, notes = _title(summary), tuple(_notes(summary))
     ranking = sweep_tables.ranking(summary)
-
-    def draw(path: Path) -> None:
-        _draw(summary, title, path)
-
     return Report(
         folder=folder,
         name="sweep.md",
@@ -55,7 +52,8 @@ def make(summary: SweepSummary, folder: Path) -> Report[SweepSummary]:
             "configurations.csv": sweep_tables.configurations_csv(summary),
             "sweep.json": _json(summary, title, notes),
         },
-        pictures={"panels.png": Picture("Performance along each axis", draw)},
+        pictures={"panels.png": "Performance along each axis"},
+        draw=partial(_draw, summary, title),
         details=list(_details(summary)),
         origins=list(_origins(summary)),
     )
@@ -135,7 +133,7 @@ def _reading(summary: SweepSummary) -> str:
     return f"{text}; the other axes {where}: {settings_text(centre)}."
 
 
-def _draw(summary: SweepSummary, title: str, path: Path) -> None:
+def _draw(summary: SweepSummary, title: str, folder: Path) -> None:
     # Here, because Matplotlib takes long to import.
     from rewire_jax.reports.sensitivity_plot import Dot, panels
 
@@ -154,7 +152,7 @@ def _draw(summary: SweepSummary, title: str, path: Path) -> None:
         UNIT,
         title,
         _reading(summary),
-        path,
+        folder / "panels.png",
         joined=not summary.sweep.random,
     )
 

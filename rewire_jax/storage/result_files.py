@@ -55,9 +55,9 @@ class Timing(NamedTuple):
     Attributes:
         hours: wall clock of training, with compilation, without selection and
             evaluation.
-        rate: interactions of a member per second, without the chunks that compiled and
-            without updates that follow a task's last interaction; None where there is
-            no other chunk.
+        rate: interactions of all members per second, without the chunks that compiled
+            and without updates that follow a task's last interaction; None where there
+            is no other chunk.
         memory: most bytes held, by `device` or, without memory of its own, `process`;
             empty where this was not recorded.
     """
@@ -78,6 +78,7 @@ def read_header(folder: Path, kind: str) -> Results:
     with run_folder.telling_version(folder, header), reading(path):
         if not isinstance(header["tasks"], list):
             raise ValueError("tasks are no list")
+        dict(header["provenance"].get("versions", {}))  # as pages show them
         results = Results(
             folder=folder,
             settings=dict(header["settings"]),
@@ -139,21 +140,20 @@ def to_arrays(rows: Rows, members: Iterable[int], tasks: int) -> dict[str, Array
     return arrays
 
 
-def read_timing(path: Path, tasks: int, *, needed: bool = True) -> Timing:
+def read_timing(path: Path, tasks: int, members: int, needed: bool) -> Timing:
     """What a `timing.jsonl` says.
 
     Args:
         path: the file.
         tasks: of the sequence.
+        members: trained together.
         needed: otherwise a missing file has no rows.
 
     Raises:
         UserError: the file is missing, or damaged elsewhere than in its last line.
     """
 
-    def parse(
-        row: dict[str, Any],
-    ) -> tuple[tuple[int, ...], tuple[float, bool, str, int]]:
+    def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[Any, ...]]:
         # Updates after a task's last interaction have reports of their own.
         updates = int(row.get("polishing", 0))
         held: Mapping[str, Any] = {"process": 0} | row.get("memory", {})
@@ -175,6 +175,6 @@ def read_timing(path: Path, tasks: int, *, needed: bool = True) -> Timing:
     where, most = max(held, key=lambda each: each[1], default=("", 0))
     return Timing(
         hours=sum(took for took, *_ in rows.values()) / 3600,
-        rate=interactions / seconds if seconds > 0 else None,
+        rate=members * interactions / seconds if seconds > 0 else None,
         memory={where: most} if most else {},
     )

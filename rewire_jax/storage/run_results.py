@@ -38,9 +38,7 @@ class RunData(Results):
         curve: per stage, interactions within the task `[points]` and the score of
             training, `[S, points]`, NaN where missing; the return is what the reward
             a step makes in a whole episode.
-        hours: of all seeds together, see `Timing`.
-        rate: of all seeds together, see `Timing`.
-        memory: see `Timing`.
+        hours, rate, memory: of all seeds together, see `Timing`.
     """
 
     seeds: tuple[int, ...]
@@ -107,7 +105,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     diverged = (values["diverged"] == 1).any(axis=(1, 2))
     trained = _curve(folder, tasks, seeds, finished > 0, score.training)
     steps = head.episode_length if score.stepwise else 1
-    timing = read_timing(folder / "timing.jsonl", tasks, needed=finished > 0)
+    timing = read_timing(folder / "timing.jsonl", tasks, len(seeds), finished > 0)
     return RunData(
         **vars(head),
         seeds=tuple(seeds),
@@ -120,9 +118,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
         training=int(np.nanmax(values["training"])),
         selection=int(np.nanmax(values["selection"])),
         curve=tuple((x, values * steps) for x, values in trained),
-        hours=timing.hours,
-        rate=timing.rate and len(seeds) * timing.rate,
-        memory=timing.memory,
+        **timing._asdict(),
     )
 
 

@@ -112,7 +112,7 @@ def read_sweep(folder: str | Path) -> SweepData:
 
     for now, place, members in _batches(head.folder, count, tasks):
         trained[members, now] = True
-        hours += read_timing(place / "timing.jsonl", tasks, needed=False).hours
+        hours += read_timing(place / "timing.jsonl", tasks, len(members), False).hours
         rows |= read_evaluations(
             place / "results.jsonl", tasks, member, also=("choice",), needed=False
         )

@@ -1,6 +1,5 @@
 """Reports on synthetic run folders with known numbers."""
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from fake_run import (
     RATES,
     SCORES,
     TRIPLET,
+    rows,
     write_alone,
     write_cw,
     write_run,
@@ -28,11 +28,6 @@ from rewire_jax.storage.run_results import read_run
 
 METHODS = ("rewire", "ft1", "sac_n")
 RAW = "Scores are raw returns, not normalised: there is no SAC-N run among them"
-
-
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def cells(report: Report[Comparison], label: str) -> dict[str, str]:
@@ -234,7 +229,7 @@ def test_diverged_seed_is_left_out(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", seeds=3, diverged=(1,))
     report = write_report([run], tmp_path / "out")
     note = report.notes[-1]
-    assert note.startswith("Ours (rewire): seed 1 diverged")
+    assert note.startswith("Ours (rewire): 1 diverged seed left out")
     (data,) = json.loads((report.folder / "result.json").read_text())["runs"]
     assert data["kept"] == [0, 2]
     assert data["tasks"][0]["end"]["values"] == [400, 800]
@@ -245,7 +240,7 @@ def test_all_seeds_diverged(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", diverged=(0, 1))
     report = write_report([run], tmp_path / "out")
     assert "| Ours (rewire) | 1 hugefoot | – | – | – | – |" in report.page.read_text()
-    assert "seeds 0, 1 diverged" in to_terminal(report).replace("\n", " ")
+    assert "pictures: 0, 1." in to_terminal(report).replace("\n", " ")
 
 
 def test_partial_run_says_so(tmp_path: Path) -> None:

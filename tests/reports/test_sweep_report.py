@@ -1,6 +1,5 @@
 """Reports of synthetic sweeps, against sums over their rows."""
 
-import csv
 import itertools
 import json
 import statistics
@@ -13,16 +12,12 @@ from rewire_jax.core import formatting
 from rewire_jax.core.errors import UserError
 from rewire_jax.reports import sensitivity_plot
 from rewire_jax.reports.write import write_report
+from tests.fake_run import rows
 from tests.fake_sweep import GRID, TASKS, choice, score, write_sweep
 
 
 def write_sweep_report(folder, out=None):
     return write_report([folder], out or folder)
-
-
-def rows(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def members(report):
