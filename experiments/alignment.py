@@ -6,24 +6,30 @@ is hoped for: adapters whose order stays, and weights that are the previous ones
 that order, so that refined wirings (Eq. 12) give the old policies back.
 """
 
-import json
+import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import tyro
 
-from rewire_jax import keep_compiled
+from experiments import suite
 from rewire_jax.methods import wiring
 from rewire_jax.nn import networks
-from rewire_jax.storage.run_folder import provenance
 
 # Form of the loss, factor on the adapters' learning rate.
 VARIANTS = (("norm", 1), ("expanded", 1), ("expanded", 10), ("expanded", 0.01))
+
+NOTES = (
+    "Squared distance of the weights to the previous ones as the adapters order them, "
+    "relative to their square, after so many updates. In parentheses: share of places "
+    "in the adapters' orders that changed in the last 100.",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +45,7 @@ class Alignment:
       tau: temperature of the adapters' relaxation.
       noise: standard deviation of the new task's gradient.
       seeds: how many.
-      out: result file; a Markdown table is written beside it.
+      out: the result files, without a suffix.
     """
 
     observations: int = 17
@@ -50,7 +56,7 @@ class Alignment:
     tau: float = 0.1
     noise: float = 0.01
     seeds: int = 3
-    out: Path = Path("experiments/results/alignment.json")
+    out: Path = suite.RESULTS / "alignment"
 
 
 def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
@@ -108,48 +114,37 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
     return jax.lax.scan(look, (params, adam.init(params)), bounds)[1]
 
 
+def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Means over seeds, a line for each form and rate."""
+    looks = sorted({row["updates"] for row in rows})
+    lines = [["form", "adapter rate", *(f"{updates:,}" for updates in looks)]]
+    for variant in VARIANTS:
+        lines.append([f"{value}" for value in variant])
+        for look in looks:
+            place = (*variant, look)
+            own = [r for r in rows if (r["form"], r["rate"], r["updates"]) == place]
+            distance, moving = (
+                statistics.mean(row[name] for row in own)
+                for name in ("distance", "moving")
+            )
+            lines[-1].append(f"{distance:.2f} ({moving:.0%})")
+    return lines
+
+
 def run(job: Alignment) -> None:
     """Computes all variants and writes the result."""
     rows = []
     for form, rate in VARIANTS:
         one = partial(learn, job, form, rate)
-        distances, moves = jax.jit(jax.vmap(one))(jnp.arange(job.seeds))
-        rows.append(
-            {
-                "form": form,
-                "adapter_rate": rate,
-                "distance": np.asarray(distances, np.float64).tolist(),
-                "moving": np.asarray(moves, np.float64).tolist(),
-            }
-        )
-    facts = provenance()
-    options = {k: v for k, v in vars(job).items() if k != "out"}
-    result = {"settings": options, "rows": rows, "provenance": facts}
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    job.out.write_text(json.dumps(result, indent=1) + "\n")
-    heads = " | ".join(f"{updates:,}" for updates in job.updates)
-    table = [
-        f"# Alignment alone, width {job.width}, beta {job.beta:g}, mean of "
-        f"{job.seeds} seeds",
-        "",
-        "Squared distance of the weights to the previous ones as the adapters order "
-        "them, relative to their square, after so many updates; in brackets the share "
-        "of places in the adapters' orders that changed in the last 100.",
-        "",
-        f"| form | adapter rate | {heads} |",
-        f"|---|---|{'---:|' * len(job.updates)}",
-    ]
-    for row in rows:
-        means = [np.mean(row[name], axis=0) for name in ("distance", "moving")]
-        cells = [f"{d:.2f} ({m:.0%})" for d, m in zip(*means, strict=True)]
-        table.append(
-            f"| {row['form']} | {row['adapter_rate']:g} | {' | '.join(cells)} |"
-        )
-    text = "\n".join(table) + "\n"
-    job.out.with_suffix(".md").write_text(text)
-    print(text)
+        found = np.array(jax.jit(jax.vmap(one))(jnp.arange(job.seeds)), np.float64)
+        for seed, look in np.ndindex(job.seeds, len(job.updates)):
+            row = {"form": form, "rate": rate, "seed": seed}
+            row |= {"updates": job.updates[look], "distance": found[0, seed, look]}
+            rows.append(row | {"moving": found[1, seed, look]})
+    title = f"Alignment alone, width {job.width}, beta {job.beta:g}"
+    title += f", mean of {job.seeds} seeds"
+    suite.write(job.out, title, table(rows), NOTES, rows)
 
 
 if __name__ == "__main__":
-    keep_compiled()
-    run(tyro.cli(Alignment, prog="python -m experiments.alignment"))
+    suite.command(Alignment, run, "alignment")

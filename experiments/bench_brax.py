@@ -13,7 +13,7 @@ import rewire_jax
 from experiments import suite
 from rewire_jax.core.settings import require
 from rewire_jax.methods import METHODS
-from rewire_jax.reports.run_report import to_terminal
+from rewire_jax.reports.report import to_terminal
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,12 +36,7 @@ def single(bench: Bench) -> list[suite.Run]:
 
 
 def run(bench: Bench) -> None:
-    """Trains each method where that is not done, and reports on all.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and reports on all; raises as `suite.train`."""
     bench_brax.run(bench, single(bench) if bench.transfer else ())
 
 

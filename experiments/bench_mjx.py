@@ -3,22 +3,24 @@
 Run by `make bench-mjx`. Rates are those of the best round; actions are random.
 """
 
-import json
-import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
-import tyro
 
+from experiments import suite
+from experiments.speed.timing import timed
 from rewire_jax.envs.base import Environment, TaskChange
 from rewire_jax.envs.metaworld import make_domain
-from rewire_jax.reports.run_tables import markdown
-from rewire_jax.storage.run_folder import provenance
 
-HEADS = ("task", "environments", "steps/s", "reset s", "kB/environment")
+COLUMNS = {
+    "task": suite.show("task"),
+    "environments": suite.show("environments"),
+    "steps/s": suite.show("steps_per_second", ",.0f"),
+    "reset s": suite.show("reset_seconds", ".2f"),
+    "kB/environment": suite.show("bytes", ".1f", 1e-3),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,7 @@ class BenchMjx:
       environments: numbers of parallel environments.
       steps: of every environment, in one compiled loop.
       rounds: how often each loop is timed.
-      out: result file; a Markdown table is written beside it.
+      out: the result files, without a suffix; named after the device if not given.
     """
 
     tasks: tuple[str, ...] = ("window-close", "push")
@@ -38,17 +40,6 @@ class BenchMjx:
     steps: int = 100
     rounds: int = 3
     out: Path | None = None
-
-
-def timed(rounds: int, function: Callable[..., Any], *arguments: Any) -> list[Any]:
-    """What a function gives, and the seconds of each of some further calls."""
-    result = jax.block_until_ready(function(*arguments))
-    seconds = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*arguments))
-        seconds.append(time.perf_counter() - start)
-    return [result, *seconds]
 
 
 def measure(job: BenchMjx, count: int) -> list[dict[str, Any]]:
@@ -75,8 +66,10 @@ def measure(job: BenchMjx, count: int) -> list[dict[str, Any]]:
     rows = []
     for name in job.tasks:
         task = domain.make_task(TaskChange(name, extra={"task": name}))
-        state, *resets = timed(job.rounds, reset, task, keys)
-        _, *plays = timed(job.rounds, play, task, state, keys[0])
+        state = reset(task, keys)
+        resets = [timed(reset, task, keys) for _ in range(job.rounds)]
+        timed(play, task, state, keys[0])  # compiles
+        plays = [timed(play, task, state, keys[0]) for _ in range(job.rounds)]
         rows.append(
             {
                 "task": name,
@@ -89,33 +82,14 @@ def measure(job: BenchMjx, count: int) -> list[dict[str, Any]]:
     return rows
 
 
-def table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """The figures as Markdown."""
-    cells = [
-        [
-            row["task"],
-            str(row["environments"]),
-            f"{row['steps_per_second']:,.0f}",
-            f"{row['reset_seconds']:.2f}",
-            f"{row['bytes'] / 1000:.1f}",
-        ]
-        for row in rows
-    ]
-    return markdown(HEADS, cells)
-
-
 def run(job: BenchMjx) -> None:
-    """Measures, prints a table and writes the result file."""
+    """Measures, and writes the result."""
     rows = [row for count in job.environments for row in measure(job, count)]
-    result = provenance() | {"steps": job.steps, "rounds": job.rounds, "rows": rows}
-    lines = table(rows)
-    print("\n".join(lines))
     device = jax.devices()[0].device_kind.lower().replace(" ", "-")
-    out = job.out or Path("experiments/results") / f"mjx-{device}.json"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(result, indent=2) + "\n")
-    out.with_suffix(".md").write_text("\n".join(lines) + "\n")
+    out = job.out or suite.RESULTS / f"mjx-{device}"
+    title = f"Meta-World on MJX-Warp, best of {job.rounds} rounds of {job.steps} steps"
+    suite.write(out, title, suite.table(rows, COLUMNS), (), rows)
 
 
 if __name__ == "__main__":
-    run(tyro.cli(BenchMjx, prog="python -m experiments.bench_mjx"))
+    suite.command(BenchMjx, run, "bench_mjx")

@@ -27,7 +27,8 @@ from experiments.speed import (
 from experiments.speed.part import Effort, Part
 from rewire_jax.core.settings import require
 from rewire_jax.reports import plots
-from rewire_jax.reports.run_tables import markdown
+from rewire_jax.reports.provenance import how_made
+from rewire_jax.reports.table import to_markdown
 from rewire_jax.storage import run_folder
 
 PARTS: dict[str, Part] = {
@@ -68,8 +69,8 @@ def report(results: Mapping[str, Any], folder: Path) -> str:
             continue
         result, rows = results[name], results[name]["rows"]
         how, load = result["provenance"], result["load"]
-        cells = [[column(row) for column in part.columns.values()] for row in rows]
-        lines += ["", f"## {part.title}", "", *markdown([*part.columns], cells)]
+        head, *body = suite.table(rows, part.columns)
+        lines += ["", f"## {part.title}", "", *to_markdown(head, body)]
         if part.picture:
             title, draw = part.picture
             figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
@@ -80,11 +81,8 @@ def report(results: Mapping[str, Any], folder: Path) -> str:
             figure.savefig(folder / f"{name}.png")
             lines += [f"![{title}]({name}.png)", ""]
         lines += [part.reading, ""]
-        lines += [
-            f"{how['device']}, load {load[0]:.1f} to {load[1]:.1f}, "
-            f"{result['seconds']:.0f} s in all, commit `{how['commit']}`, "
-            f"`{how['command']}`"
-        ]
+        took = f"in {result['seconds']:.0f} s, load {load[0]:.1f} to {load[1]:.1f}"
+        lines += [f"Measured {took}, on {how_made(how)}."]
     return "\n".join(lines) + "\n"
 
 

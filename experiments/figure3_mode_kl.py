@@ -72,16 +72,9 @@ def tell(curve: Curve) -> str:
 
 
 def run(job: FirstTask) -> None:
-    """Trains what is not finished, and draws the figure.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
     variants = {name: VARIANTS[name] for name in LABELS}
-    runs = job.first_runs(variants)
-    suite.train(runs, job)
-    evolved = first_task.read("Figure 3", runs, LABELS, "mode_divergence")
+    evolved = first_task.train(job, "Figure 3", variants, LABELS, "mode_divergence")
     notes = (
         "Diverge-and-converge is said to appear where the divergence ends below half "
         "of its peak, both being medians over a tenth of the progress reports.",

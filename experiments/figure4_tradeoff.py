@@ -7,7 +7,7 @@ wider. Widths are the paper's 175 and 384 of 256, scaled to the profile's networ
 from dataclasses import dataclass
 
 import rewire_jax
-from experiments import suite
+from experiments import averages, suite
 from rewire_jax.reports import paper_results
 from rewire_jax.reports.tradeoff_plot import Point, tradeoff
 
@@ -36,27 +36,23 @@ def variants(job: Figure4, name: str) -> suite.Variants:
 
 
 def run(job: Figure4) -> None:
-    """Trains what is not finished, and writes a report a scenario and the figure.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
     out = job.folder("figure4")
     runs = [r for name in job.scenarios for r in job.runs(name, variants(job, name))]
     reports = suite.reports(suite.train(runs, job), out)
-    found = suite.averages(reports)
+    found = averages.over_scenarios(reports)
     labels = paper_results.NAMES | {label.lower(): label for label in SIZED}
     table, rows, points = [["method", "performance", "model size"]], [], []
     for name, label in labels.items():
         ours = found.get(name)
-        table.append([label, suite.text(ours, len(job.scenarios)), suite.size(ours)])
-        rows.append({"method": label} | suite.columns("", ours))
+        shown = averages.text(ours, len(job.scenarios))
+        table.append([label, shown, averages.size(ours)])
+        rows.append({"method": label} | averages.columns("", ours))
         if ours:
             points.append(Point(label, ours.size, ours.mean, ours.std))
     title = f"Figure 4, {', '.join(job.scenarios)}, {job.profile} profile"
     picture = out / "figure4.png"
-    notes = (f"![{title}]({picture.name})", "", suite.READING, "")
+    notes = (f"![{title}]({picture.name})", "", averages.READING, "")
     suite.write(out / "figure4", title, table, (*notes, *suite.origins(reports)), rows)
     tradeoff(points, "÷ SAC-N", title, picture)
     print(picture)

@@ -14,6 +14,7 @@ from experiments import first_task, suite
 from experiments.first_task import FirstTask, Trained
 from rewire_jax.core.formatting import number
 from rewire_jax.reports.plots import Array
+from rewire_jax.reports.table import to_markdown
 
 # On the first task there is nothing to align with.
 VARIANTS: suite.Variants = {
@@ -105,22 +106,16 @@ def by_seed(found: dict[str, Trained]) -> Iterator[str]:
     yield "Each seed, at the end of training | without exploration after it:"
     yield ""
     seeds = sorted({seed for trained in found.values() for seed in trained.seeds})
-    yield "| | " + " | ".join(f"seed {seed}" for seed in seeds) + " |"
-    yield "| --- |" + " ---: |" * len(seeds)
+    rows = []
     for trained in found.values():
-        known = dict(
-            zip(
-                trained.seeds,
-                zip(trained.end, trained.returns, strict=True),
-                strict=True,
-            )
-        )
+        ends = zip(trained.end, trained.returns, strict=True)
+        known = dict(zip(trained.seeds, ends, strict=True))
         cells = [
             " / ".join(map(number, known[seed])) if seed in known else "–"
             for seed in seeds
         ]
-        yield f"| {trained.curve.label} | {' | '.join(cells)} |"
-    yield ""
+        rows.append([trained.curve.label, *cells])
+    yield from to_markdown(["", *(f"seed {seed}" for seed in seeds)], rows)
 
 
 def by_pair(found: dict[str, Trained]) -> Iterator[str]:
@@ -151,15 +146,8 @@ def notes(found: dict[str, Trained]) -> Sequence[str]:
 
 
 def run(job: FirstTask) -> None:
-    """Trains what is not finished, and draws the figure.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
-    runs = job.first_runs(VARIANTS)
-    suite.train(runs, job)
-    evolved = first_task.read("Figure 5", runs, LABELS)
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
+    evolved = first_task.train(job, "Figure 5", VARIANTS, LABELS)
     path = job.folder("figure5") / "figure5"
     found = evolved.found
     first_task.write(

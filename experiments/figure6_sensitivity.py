@@ -49,12 +49,7 @@ def configurations(job: Figure6, options: Any) -> list[dict[str, float]]:
 
 
 def run(job: Figure6) -> None:
-    """Trains what is not finished, and writes the figure and its numbers.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and draws the figure; raises as `suite.train`."""
     scenario = job.scenario_of(job.scenario)
     what = "figure6-grid" if job.full else "figure6-lines"
     folder = job.out / job.name(job.scenario) / what
@@ -69,8 +64,8 @@ def run(job: Figure6) -> None:
             resume=made.started,
         )
     out = job.folder(f"{what}-{job.scenario}")
-    report = rewire_jax.write_sweep_report(folder, out)
-    print(report.markdown.read_text(encoding="utf-8"))
+    report = rewire_jax.write_report([folder], out)
+    print(report.page.read_text(encoding="utf-8"))
     print(*report.paths, sep="\n")
 
 

@@ -16,14 +16,15 @@ from experiments import suite
 from rewire_jax.core.formatting import number
 from rewire_jax.core.settings import require
 from rewire_jax.reports.plots import Array
+from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.titles import heading
 from rewire_jax.reports.training_curve_plot import Curve, evolution
 from rewire_jax.storage.run_results import RunData, read_progress, read_run
 
 READING = (
-    "Over seeds; those that diverged have no part in it, nor have runs that are not "
-    "finished. The end is the time of the last whole episode: all environments begin "
-    "theirs together, so each part of an episode counts once."
+    "Values are over seeds. Diverged seeds and unfinished runs are left out. The end "
+    "is the last whole episode: all environments start their episodes together, so "
+    "each part of an episode counts once."
 )
 _EPISODES = 128
 _REPORT, _CHECKPOINT = 12_800, 100_000
@@ -125,6 +126,19 @@ class Evolution(NamedTuple):
     origins: list[str]
 
 
+def train(
+    job: FirstTask,
+    subject: str,
+    variants: suite.Variants,
+    labels: Mapping[str, str],
+    value: str | None = None,
+) -> Evolution:
+    """Trains what is unfinished, and reads it; raises as `suite.train` and `read`."""
+    runs = job.first_runs(variants)
+    suite.train(runs, job)
+    return read(subject, runs, labels, value)
+
+
 def read(
     subject: str,
     runs: Sequence[suite.Run],
@@ -154,14 +168,12 @@ def read(
             found[name] = _gather(label, kept, value)
             settings, tasks = kept[0].settings, len(kept[0].tasks)
         if datas:
-            origins.append(_origin(label, datas))
+            origins.append(origin(label, *datas))
     require(bool(found), "none of the runs has ended without divergence")
     missing = [str(run.folder) for run in runs if not run.finished]
     if missing:
         origins.append(f"- **not finished: {', '.join(missing)}**")
-    counts = sorted({len(trained.seeds) for trained in found.values()})
-    several = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
-    seeds = f"{several} seed{'' if counts[-1] == 1 else 's'}"
+    seeds = [len(trained.seeds) for trained in found.values()]
     subject = f"{subject} on the first task of {settings['scenario']}"
     return Evolution(heading(subject, settings, tasks, seeds), found, origins)
 
@@ -177,20 +189,6 @@ def _gather(label: str, kept: Sequence[RunData], value: str | None) -> Trained:
         tuple(seed for run in kept for seed in run.seeds),
         np.concatenate([run.scores[:, 0, 0] for run in kept]),
         kept[0].episode_length * float(kept[0].settings["envs"]),
-    )
-
-
-def _origin(label: str, datas: Sequence[RunData]) -> str:
-    """Markdown: where the runs of a variant come from."""
-    seeds = ", ".join(str(seed) for data in datas for seed in data.seeds)
-    lost = ", ".join(str(seed) for data in datas for seed in data.diverged)
-    commits = dict.fromkeys(f"`{data.provenance.get('commit')}`" for data in datas)
-    devices = dict.fromkeys(str(data.provenance.get("device")) for data in datas)
-    return (
-        f"- {label}: `{datas[0].folder.parent}`, seeds {seeds}"
-        + (f" (diverged: {lost})" if lost else "")
-        + f", commit {', '.join(commits)}, {', '.join(devices)}, command "
-        f"`{datas[0].provenance.get('command')}`"
     )
 
 

@@ -7,8 +7,6 @@ times, so that what slows the machine for longer does not count, and medians of 
 
 import dataclasses
 import itertools
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +16,23 @@ import numpy as np
 
 import rewire_jax
 from experiments import suite
+from experiments.speed.timing import timed
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.envs.vector_env import VectorEnv
 from rewire_jax.training.run_setup import Plan, prepare
+
+COLUMNS = {
+    "method": suite.show("method"),
+    "members": suite.show("members"),
+    "width": suite.show("hidden"),
+    "simulators": suite.show("simulators_ms", ".0f"),
+    "updates": suite.show("updates_ms", ".0f"),
+    "loop": suite.show("loop_ms", ".0f"),
+    "÷ sum": suite.show("loop_over_sum", ".2f"),
+    "with overlap": suite.show("overlapped_ms", ".0f"),
+    "÷ larger": suite.show("overlapped_over_larger", ".2f"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,13 +103,6 @@ def simulate(lanes: VectorEnv, environment: HostEnvironment, steps: int) -> None
         lanes.step(draw.uniform(-1, 1, size).astype(np.float32))
 
 
-def timed(function: Callable[..., Any], *arguments: Any) -> float:
-    """Seconds."""
-    began = time.perf_counter()
-    function(*arguments)
-    return time.perf_counter() - began
-
-
 def measure(job: HostLoop, method: str, width: int) -> dict[str, Any]:
     """Milliseconds for 50 steps and 50 updates of all members, and ratios; medians."""
     scenario = rewire_jax.make_scenario(job.scenario)
@@ -148,23 +152,13 @@ def run(job: HostLoop) -> None:
     require(job.times > 0, f"--times must be at least 1, not {job.times}")
     cases = itertools.product(job.widths, job.methods)
     rows = [measure(job, method, width) for width, method in cases]
-    head = ["method", "members", "width", "simulators", "updates", "loop"]
-    head += ["÷ sum", "with overlap", "÷ larger"]
-    table = [head]
-    for row in rows:
-        cells = [f"{row[f'{name}_ms']:.0f} ms" for name in ("simulators", "updates")]
-        cells += [f"{row['loop_ms']:.0f} ms", f"{row['loop_over_sum']:.2f}"]
-        cells += [f"{row['overlapped_ms']:.0f} ms"]
-        cells += [f"{row['overlapped_over_larger']:.2f}"]
-        names = [row["method"], str(row["members"]), str(row["hidden"])]
-        table.append(names + cells)
     title = f"{job.scenario}, paper profile: milliseconds for 50 steps and 50 updates"
     notes = [
         f"Medians of {job.rounds} rounds; simulators and updates were timed alone. "
         "With overlap, the next steps are made while updates go on, by the policy "
         "before these."
     ]
-    suite.write(job.out, title, table, notes, rows)
+    suite.write(job.out, title, suite.table(rows, COLUMNS), notes, rows)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ Nothing is trained or compiled: `rewire_jax.training.memory_estimate` counts it 
 shapes and traces.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,21 @@ from rewire_jax.training.run_setup import prepare
 SCENARIOS = ("halfcheetah/forgetting", "continual_world/t3")
 TITLE = "Memory of a member, in MB"
 READING = (
-    "Counted for the paper profile before anything is compiled: what learning changes, "
-    "the replay buffer, the environments, what is taken for a while beside these in "
-    "training, and beside the learner alone in an evaluation. The most at a time is "
-    "the learner with the larger of training and evaluation. Environments that are "
-    "stepped on the host take nothing of the device."
+    "Counted for the paper profile before anything is compiled: the learner, the "
+    "replay buffer, the environments, temporary arrays of training (work), and "
+    "temporary arrays of an evaluation. The total is the learner and the larger of "
+    "training and evaluation. Environments that are stepped on the host take no memory "
+    "of the device."
 )
+COLUMNS = {
+    "scenario": suite.show("scenario"),
+    "method": lambda row: NAMES[row["method"]],
+    "side by side": suite.show("envs"),
+    **{
+        part: suite.show(part, ".1f", 1e-6)
+        for part in (*memory_estimate.Need._fields, "total")
+    },
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,21 +79,10 @@ def rows(envs: Sequence[int]) -> Iterator[dict[str, Any]]:
             yield count(scenario, "rewire", number)
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """A line for each row."""
-    parts = [*memory_estimate.Need._fields, "total"]
-    lines = [
-        [row["scenario"], NAMES[row["method"]], str(row["envs"])]
-        + [f"{row[part] / 1e6:.1f}" for part in parts]
-        for row in rows
-    ]
-    return [["scenario", "method", "environments", *parts], *lines]
-
-
 def run(job: MemoryNeeds) -> None:
     """Counts all and writes it."""
     made = list(rows(job.envs))
-    suite.write(job.out, TITLE, table(made), (READING,), made)
+    suite.write(job.out, TITLE, suite.table(made, COLUMNS), (READING,), made)
 
 
 if __name__ == "__main__":

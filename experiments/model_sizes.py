@@ -17,8 +17,6 @@ from rewire_jax.reports import paper_results
 from rewire_jax.run.evaluation import most_stored
 from rewire_jax.training.run_setup import base_size, make_spec
 
-# Length of observations in the brax v1 of the paper's runs, where it is known for
-# certain and another than in brax v2.
 TITLE = "Model size: most numbers stored in a run, divided by those of a plain policy"
 FORMULAS = {
     "ft1": "1",

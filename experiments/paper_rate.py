@@ -10,11 +10,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 import rewire_jax
-from rewire_jax.storage.run_folder import provenance
+from experiments import suite
 
+COLUMNS = {
+    "scenario": suite.show("scenario"),
+    "interactions/s": suite.show("interactions_per_second", ".0f"),
+    "whole scenario": suite.show("paper_interactions", ","),
+    "hours of training": suite.show("hours", ".1f"),
+}
 SCENARIOS = ("halfcheetah/forgetting", "ant/forgetting", "humanoid/hard")
 
 
@@ -25,12 +29,12 @@ class PaperRate:
     Attributes:
       method: name of the method.
       interactions: of the first task of each scenario.
-      out: result file; a Markdown table is written beside it.
+      out: the result files, without a suffix.
     """
 
     method: str = "rewire"
     interactions: int = 20_480
-    out: Path = Path("experiments/results/paper-rate.json")
+    out: Path = suite.RESULTS / "paper-rate"
 
 
 def measure(name: str, job: PaperRate, folder: Path) -> dict[str, Any]:
@@ -55,6 +59,7 @@ def measure(name: str, job: PaperRate, folder: Path) -> dict[str, Any]:
     total = paper.tasks * paper.interactions
     return {
         "scenario": name,
+        "method": job.method,
         "backend": scenario.backend,
         "interactions": settings.interactions,
         "interactions_per_second": rate,
@@ -70,27 +75,12 @@ def run(job: PaperRate) -> None:
             measure(name, job, Path(folder) / str(number))
             for number, name in enumerate(SCENARIOS)
         ]
-    facts = provenance()
-    result = {"method": job.method, "rows": rows, "provenance": facts}
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    job.out.write_text(json.dumps(result, indent=1) + "\n")
-    table = [
-        f"# {job.method}, paper profile, 1 seed, {rows[0]['backend']} backend, first "
-        f"{job.interactions:,} interactions; {facts['device']}",
-        "",
-        "| scenario | interactions/s | whole scenario | training would take |",
-        "|---|---|---|---|",
-    ]
-    table += [
-        f"| {row['scenario']} | {row['interactions_per_second']:.0f} "
-        f"| {row['paper_interactions']:,} | {row['hours']:.1f} h |"
-        for row in rows
-    ]
-    text = "\n".join(table) + "\n"
-    job.out.with_suffix(".md").write_text(text)
-    print(text)
+    title = (
+        f"{job.method}, paper profile, 1 seed, {rows[0]['backend']} backend, first "
+        f"{job.interactions:,} interactions"
+    )
+    suite.write(job.out, title, suite.table(rows, COLUMNS), (), rows)
 
 
 if __name__ == "__main__":
-    rewire_jax.keep_compiled()
-    run(tyro.cli(PaperRate, prog="python -m experiments.paper_rate"))
+    suite.command(PaperRate, run, "paper_rate")

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import suite
+from experiments import averages, suite
 from rewire_jax.core.settings import require
 from rewire_jax.methods import METHODS
 from rewire_jax.reports import paper_results
@@ -79,7 +79,7 @@ def write(
     for group, runs in groups.items():
         made = suite.reports([run for run in runs if run in done], path.parent, success)
         reports += made
-        found = suite.averages(made)
+        found = averages.over_scenarios(made)
         sources = paper_results.sources(runs[0].settings.scenario)
         sized = not sources or sources[0].sized
         head += [group, "model size", "paper"]
@@ -88,15 +88,15 @@ def write(
             ours = found.get(method)
             theirs = sources[0].results.get(method) if sources else None
             line += [
-                suite.text(ours, len(runs) // len(methods)),
-                suite.size(ours),
-                suite.text(theirs),
+                averages.text(ours, len(runs) // len(methods)),
+                averages.size(ours),
+                averages.text(theirs),
             ]
-            line += [suite.size(theirs)] if sized else []
+            line += [averages.size(theirs)] if sized else []
             rows.append(
                 {kind: group, "method": method}
-                | suite.columns("", ours)
-                | suite.columns("paper_", theirs)
+                | averages.columns("", ours)
+                | averages.columns("paper_", theirs)
             )
     notes = (reading, "", *suite.origins(reports))
     suite.write(path, title, [head, *lines.values()], notes, rows)

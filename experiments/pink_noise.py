@@ -6,8 +6,7 @@ to one side for longer.
 
 from experiments import first_task, suite
 from experiments.first_task import FirstTask, Trained
-from rewire_jax.reports import run_tables
-from rewire_jax.reports.run_summary import spread
+from rewire_jax.reports.spread import spread
 
 # Two of the runs are Figure 5's.
 VARIANTS: suite.Variants = {
@@ -20,20 +19,12 @@ LABELS = {"ft1": "FT-1", "ft1-pink": "FT-1, pink noise", "rewire": "Ours"}
 
 def tell(trained: Trained) -> str:
     """Evaluations after the first task, in Markdown."""
-    returns = run_tables.spread(spread(trained.returns))
-    return f"- {trained.curve.label}: **{returns}**"
+    return f"- {trained.curve.label}: **{spread(trained.returns)}**"
 
 
 def run(job: FirstTask) -> None:
-    """Trains what is not finished, and draws the curves.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
-    runs = job.first_runs(VARIANTS)
-    suite.train(runs, job)
-    evolved = first_task.read("Pink noise", runs, LABELS)
+    """Trains what is unfinished, and draws it; raises as `suite.train`."""
+    evolved = first_task.train(job, "Pink noise", VARIANTS, LABELS)
     notes = (
         "Training returns are those of exploring actions. Evaluated without noise "
         "after the task, mean ± sample standard deviation over seeds:",

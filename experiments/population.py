@@ -37,6 +37,19 @@ READING = (
     "that of a chunk, traced and without a cache of earlier compilations."
 )
 
+COLUMNS = {
+    "members": suite.show("members"),
+    "compile, s": suite.show("compile_seconds", ".0f"),
+    "processor s": suite.show("compile_processor_seconds", ".0f"),
+    "estimated, MB a member": suite.show("estimated", ".1f", 1e-6),
+    "planned, MB a member": lambda row: (
+        f"{(row['argument'] + row['temporary']) / 1e6:.1f}"
+    ),
+    "peak, MB": suite.show("peak", ",.0f", 1e-6),
+    "ms a member and interaction": suite.show("seconds", ".3g", 1e3),
+    "processor ms": suite.show("processor_seconds", ".3g", 1e3),
+}
+
 
 @dataclass(frozen=True, kw_only=True)
 class Population:
@@ -134,23 +147,6 @@ def apart(job: Population, members: int) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """A line for each size."""
-    shown = {
-        "members": lambda row: f"{row['members']}",
-        "compile, s": lambda row: f"{row['compile_seconds']:.0f}",
-        "processor s": lambda row: f"{row['compile_processor_seconds']:.0f}",
-        "estimated, MB a member": lambda row: f"{row['estimated'] / 1e6:.1f}",
-        "planned, MB a member": lambda row: (
-            f"{(row['argument'] + row['temporary']) / 1e6:.1f}"
-        ),
-        "peak, MB": lambda row: f"{row['peak'] / 1e6:,.0f}",
-        "ms a member and interaction": lambda row: f"{1e3 * row['seconds']:.3g}",
-        "processor ms": lambda row: f"{1e3 * row['processor_seconds']:.3g}",
-    }
-    return [list(shown), *([cell(row) for cell in shown.values()] for row in rows)]
-
-
 def headline(rows: Sequence[Mapping[str, Any]], key: str) -> list[str]:
     """Markdown: what the larger populations cost, in units of the smallest.
 
@@ -173,10 +169,7 @@ def draw(rows: Sequence[Mapping[str, Any]], key: str, path: Path) -> None:
     """Writes the picture: time per member against members."""
     figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
     members = [row["members"] for row in rows]
-    times = [1e3 * row[key] for row in rows]
-    axes.plot(members, times, marker="o", **plots.look(0))
-    plots.doubling(axes, members)
-    axes.set_ylim(0, 1.1 * max(times))
+    plots.by_size(axes, members, [1e3 * row[key] for row in rows])
     axes.set_xlabel("members side by side")
     axes.set_ylabel("ms a member and interaction")
     axes.grid(color="0.9")
@@ -213,11 +206,11 @@ def run(job: Population) -> None:
         "",
         READING,
         "",
-        f"{job.method} on {job.scenario}, {job.profile} profile; {device.device_kind}, "
-        f"{cores} cores for this, load {before:.1f} to {after:.1f}; best of "
+        f"{job.method} on {job.scenario}, {job.profile} profile; {cores} cores for "
+        f"this, load {before:.1f} to {after:.1f}; best of "
         f"{job.rounds} rounds of {job.steps} steps.",
     )
-    suite.write(out, "Members side by side", table(rows), notes, rows)
+    suite.write(out, "Members side by side", suite.table(rows, COLUMNS), notes, rows)
     draw(rows, key, out.with_suffix(".png"))
     print(out.with_suffix(".png"))
 

@@ -14,12 +14,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rewire_jax.core.errors import UserError
+from rewire_jax.reports.table import to_markdown
 
 PAGES = (Path("README.md"), Path("docs/results.md"), Path("docs/speed.md"))
 RESULTS = Path("experiments/results")
 _BLOCK = re.compile(
     r"(<!-- results: (\S+)(?: \| ([^\n]*))? -->\n).*?(<!-- end -->)", re.DOTALL
 )
+_BETWEEN = re.compile(r"(?<!\\)\|")
 _FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
 
@@ -61,15 +63,15 @@ def _columns(report: str, heads: Sequence[str], name: str) -> str:
     title, *lines = report.splitlines()
     lines = list(itertools.dropwhile(lambda line: not line.startswith("|"), lines))
     table = itertools.takewhile(lambda line: line.startswith("|"), lines)
-    rows = [[cell.strip() for cell in line[1:-1].split("|")] for line in table]
+    rows = [[cell.strip() for cell in _BETWEEN.split(line[1:-1])] for line in table]
     places = []
     for head in heads:
         found = [i for i, cell in enumerate(rows[0]) if cell.startswith(head)]
         if not found:
             raise UserError(f"{name} has no column that begins with {head!r}")
         places.append(found[0])
-    picked = ["| " + " | ".join(row[i] for i in places) + " |" for row in rows]
-    return "\n".join([title, "", *picked])
+    top, _, *body = ([row[i].replace(r"\|", "|") for i in places] for row in rows)
+    return "\n".join([title, "", *to_markdown(top, body)])
 
 
 def main() -> None:

@@ -4,7 +4,6 @@ A run that is finished is not run again, and one that was stopped goes on, so th
 command can be given until all is done. Experiments find each other's runs.
 """
 
-import statistics
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,12 +16,13 @@ import tyro
 import rewire_jax
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import require
-from rewire_jax.reports.paper_results import Figures
-from rewire_jax.reports.run_report import Report
-from rewire_jax.reports.run_summary import Summary
-from rewire_jax.reports.run_tables import csv_text, json_text
+from rewire_jax.reports.data_files import csv_text, json_text
+from rewire_jax.reports.provenance import how_made
+from rewire_jax.reports.report import Report
+from rewire_jax.reports.run_summary import Comparison
+from rewire_jax.reports.table import to_markdown
 from rewire_jax.storage.run_folder import HEADER, TABLES, compare, provenance
-from rewire_jax.storage.run_results import RunData, read_run
+from rewire_jax.storage.run_results import read_run
 from rewire_jax.storage.scores import Success
 from rewire_jax.training.run_setup import prepare
 
@@ -30,16 +30,12 @@ T = TypeVar("T")
 Variants = dict[str, tuple[str, dict[str, Any]]]
 """Methods and some of their options, SAC's among them, by the name of the run."""
 
+Row = dict[str, Any]
+"""The numbers of a line of a table, and what they belong to."""
+Columns = Mapping[str, Callable[[Row], str]]
+"""What a table shows of its rows, by heading."""
+
 RESULTS = Path("experiments/results")
-AVERAGED = (
-    "that of several scenarios is the mean over them, of means and of standard "
-    "deviations over seeds. Runs that are not finished have no part in it. Model size "
-    "is in plain policies."
-)
-READING = (
-    "Performance is the return at the end, averaged over tasks, divided by that of "
-    f"SAC-N; {AVERAGED} The paper's results were made on Brax v1 (`--backend v1`)."
-)
 _KINDS = ("forgetting", "transfer", "robustness", "compositionality")
 DOMAINS = {
     "halfcheetah": tuple(f"halfcheetah/{kind}" for kind in _KINDS),
@@ -185,7 +181,9 @@ def train(runs: Sequence[Run], job: Job) -> list[Run]:
     return evaluated
 
 
-def reports(runs: Sequence[Run], out: Path, success: Success = "any") -> list[Report]:
+def reports(
+    runs: Sequence[Run], out: Path, success: Success = "any"
+) -> list[Report[Comparison]]:
     """Writes a report for each scenario into a folder of its own.
 
     Args:
@@ -203,92 +201,13 @@ def reports(runs: Sequence[Run], out: Path, success: Success = "any") -> list[Re
     ]
 
 
-class Average(NamedTuple):
-    """What the runs of a name have in common.
-
-    Attributes:
-      mean: performance in its reports' unit, the mean over scenarios of that over
-        seeds.
-      std: the mean over scenarios of the standard deviation over seeds; None with a
-        single seed.
-      size: model size, the mean over scenarios.
-      scenarios: how many these are.
-    """
-
-    mean: float
-    std: float | None
-    size: float
-    scenarios: int
-
-
-def averages(made: Sequence[Report]) -> dict[str, Average]:
-    """Averages over scenarios by name of the run's folder.
-
-    Runs that are not finished, or that no SAC-N run normalises where one should, have
-    no part in them.
-    """
-    found: dict[str, list[Summary]] = {}
-    for report in made:
-        for summary in () if report.comparison.raw else report.summaries:
-            if summary.run.complete and summary.performance.values:
-                found.setdefault(summary.run.folder.name, []).append(summary)
-    return {name: _average(summaries) for name, summaries in found.items()}
-
-
-def _average(summaries: Sequence[Summary]) -> Average:
-    stds = [s.performance.std for s in summaries]
-    return Average(
-        mean=statistics.mean(s.performance.mean or 0.0 for s in summaries),
-        std=None if None in stds else statistics.mean(x for x in stds if x is not None),
-        size=statistics.mean(s.run.model_size for s in summaries),
-        scenarios=len(summaries),
-    )
-
-
-def text(value: Average | Figures | None, scenarios: int = 1) -> str:
-    """A performance as tables show it; says so if it is not of all scenarios."""
-    if value is None:
-        return "–"
-    shown = f"{value.mean:.2f}"
-    if value.std is not None:
-        shown += f" ± {value.std:.2f}"
-    if isinstance(value, Average) and value.scenarios < scenarios:
-        shown += f" ({value.scenarios} of {scenarios} scenarios)"
-    return shown
-
-
-def size(value: Average | Figures | None) -> str:
-    """A model size as tables show it; the paper's has one decimal."""
-    if value is None or value.size is None:
-        return "–"
-    return f"{value.size:.2f}" if isinstance(value, Average) else f"{value.size:.1f}"
-
-
-def columns(prefix: str, value: Average | Figures | None) -> dict[str, Any]:
-    """The same as numbers, for `write`."""
-    names = {"mean": "performance", "std": "performance_std", "size": "model_size"}
-    return {prefix + to: getattr(value, name, None) for name, to in names.items()}
-
-
-def origins(made: Sequence[Report]) -> list[str]:
+def origins(made: Sequence[Report[Comparison]]) -> list[str]:
     """Markdown: what the reports are of, what is missing, where runs come from."""
     lines = []
     for report in made:
         lines += [f"- {report.title}", *(f"  - **{note}**" for note in report.notes)]
-        lines += [f"  - {origin(each.label, each.run)}" for each in report.summaries]
+        lines += [f"  {line}" for line in report.origins]
     return lines
-
-
-def origin(label: str, run: RunData) -> str:
-    """Markdown: where a run's numbers come from."""
-    seeds, how = ", ".join(str(seed) for seed in run.seeds), run.provenance
-    if run.diverged:
-        seeds += f" (diverged: {', '.join(str(seed) for seed in run.diverged)})"
-    return (
-        f"{label}: `{run.folder}`, seeds {seeds}, {run.finished} of "
-        f"{len(run.tasks)} tasks, commit `{how.get('commit')}`, "
-        f"started `{how.get('started')}`"
-    )
 
 
 def write(
@@ -307,16 +226,45 @@ def write(
       notes: lines of Markdown below it.
       rows: the numbers, all with the same columns.
     """
-    head, *body = table
-    lines = [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *body)]
-    shown = "\n".join([f"# {title}", "", *lines, "", *notes]) + "\n"
-    result = {"title": title, "rows": rows, "provenance": provenance()}
+    made = provenance()
+    shown = page(title, table, notes, made)
+    result = {"title": title, "rows": rows, "provenance": made}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.with_suffix(".md").write_text(shown, encoding="utf-8")
     path.with_suffix(".json").write_text(json_text(result))
     path.with_suffix(".csv").write_text(csv_text(rows))
     print(shown)
     print(*(path.with_suffix(end) for end in (".md", ".csv", ".json")), sep="\n")
+
+
+def table(rows: Sequence[Row], columns: Columns) -> list[list[str]]:
+    """For people: what the columns show of each row, their headings first."""
+    return [[*columns], *([show(row) for show in columns.values()] for row in rows)]
+
+
+def show(name: str, form: str = "", times: float = 1) -> Callable[[Row], str]:
+    """A column: a value of the row so many times, or a dash where it has none."""
+
+    def text(row: Row) -> str:
+        value = row.get(name)
+        if value is None:
+            return "–"
+        return format(value if times == 1 else times * value, form)
+
+    return text
+
+
+def page(
+    title: str,
+    table: Sequence[Sequence[str]],
+    notes: Sequence[str],
+    made: Mapping[str, Any],
+) -> str:
+    """Markdown of a result, see `write`; `made` is its provenance."""
+    head, *body = table
+    lines = [f"# {title}", "", *to_markdown(head, body), *notes]
+    below = f"Made on {how_made(made)}."
+    return "\n".join(lines).rstrip("\n") + f"\n\n{below}\n"
 
 
 def command(kind: type[T], run: Callable[[T], Any], name: str) -> None:

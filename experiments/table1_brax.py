@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from experiments import paper_table, suite
+from experiments import averages, paper_table, suite
 
 SCENARIOS = tuple(name for names in suite.DOMAINS.values() for name in names)
 
@@ -21,19 +21,14 @@ class Table1(paper_table.Table):
 
 
 def run(job: Table1) -> None:
-    """Trains what is not finished, and writes a report a scenario and the table.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and writes the table; raises as `suite.train`."""
     domains = {name: name.split("/")[0] for name in job.scenarios}
     paper_table.write(
         job,
         job.runs_of(domains, always=("sac_n",)),
         "domain",
         f"Table 1, {job.profile} profile",
-        suite.READING,
+        averages.READING,
         job.folder("table1") / "table1",
     )
 

@@ -6,7 +6,7 @@ sequences on Meta-World v3, the paper's are on v1.
 
 from dataclasses import dataclass
 
-from experiments import paper_table, suite
+from experiments import averages, paper_table, suite
 from rewire_jax.core.settings import require
 from rewire_jax.reports import paper_results
 from rewire_jax.storage.scores import SUCCESS, Success
@@ -30,12 +30,7 @@ class Table2(paper_table.Table):
 
 
 def run(job: Table2) -> None:
-    """Trains what is not finished, and writes a report a scenario and the table.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and writes the table; raises as `suite.train`."""
     for name in job.scenarios:
         known = f"{SCENARIOS[0]} to {SCENARIOS[-2]} and {CW10}"
         require(name in SCENARIOS, f"Table 2 is of {known}, not of {name}")
@@ -52,8 +47,8 @@ def run(job: Table2) -> None:
     score = SUCCESS[job.success]
     (paper,) = paper_results.sources(CW10)
     reading = (
-        f"Performance is the {score.noun}, averaged over tasks after the last of them; "
-        f"{suite.AVERAGED} {score.evaluated} The paper's results are {paper.made}."
+        f"Performance is the {score.noun} after the last task, averaged over tasks. "
+        f"{averages.AVERAGED} {score.evaluated} The paper's results are {paper.made}."
     )
     out = job.folder("table2" if job.success == "any" else "table2-last")
     paper_table.write(

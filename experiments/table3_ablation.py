@@ -8,7 +8,7 @@ besides, to normalise.
 from dataclasses import dataclass
 
 import rewire_jax
-from experiments import suite
+from experiments import averages, suite
 from rewire_jax.reports import paper_results
 
 # By name of the run: marks for rewiring ("*": without caching), multi-mode and
@@ -52,27 +52,21 @@ def variants(job: Table3) -> suite.Variants:
 
 
 def run(job: Table3) -> None:
-    """Trains what is not finished, and writes the report and the table.
-
-    Raises:
-      UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
-    """
+    """Trains what is unfinished, and writes the table; raises as `suite.train`."""
     out = job.folder("table3")
     runs = suite.train(job.runs(job.scenario, variants(job)), job)
     reports = suite.reports(runs, out)
-    found = suite.averages(reports)
+    found = averages.over_scenarios(reports)
     head = ["rewire", "multi-mode", "alignment", "performance", "model size", "paper"]
     table, rows = [head], []
     for name, marks in ROWS.items():
         ours, paper = found.get(name), paper_results.ABLATION[name]
-        cells = suite.text(ours), suite.size(ours), suite.text(paper)
+        cells = averages.text(ours), averages.size(ours), averages.text(paper)
         table.append([*marks, *cells])
-        rows.append(
-            {"run": name} | suite.columns("", ours) | suite.columns("paper_", paper)
-        )
+        row = {"run": name} | averages.columns("", ours)
+        rows.append(row | averages.columns("paper_", paper))
     notes = (
-        suite.READING,
+        averages.READING,
         "",
         "\\*: without caching. Rows without alignment hold the weights near the "
         "previous ones, with FT-L2's coefficient. The paper's are of "

@@ -19,8 +19,7 @@ from rewire_jax.envs.scenarios import (
 from rewire_jax.methods import register_method
 from rewire_jax.nn.permutation import permute
 from rewire_jax.rendering.render import render
-from rewire_jax.reports.run_report import write_report
-from rewire_jax.reports.sweep_report import write_sweep_report
+from rewire_jax.reports.write import write_report
 from rewire_jax.run.evaluation import evaluate, info
 from rewire_jax.run.interrupts import Stopped
 from rewire_jax.run.policies import load_policies, load_policy
@@ -57,5 +56,4 @@ __all__ = [
     "sweep",
     "train",
     "write_report",
-    "write_sweep_report",
 ]

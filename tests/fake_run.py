@@ -1,5 +1,6 @@
 """Writes run folders with known numbers, for the tests of what reads them."""
 
+import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,13 @@ import numpy as np
 
 TASKS = ("hugefoot", "moon", "carry_stuff")
 BUDGET = 1000
+PROVENANCE = {
+    "command": "rewire-jax train",
+    "commit": "abc123",
+    "versions": {"jax": "0.10.2"},
+    "device": "cpu",
+    "started": "2025-01-01T00:00:00",
+}
 # Row 0 before any training, then after training task 0, 1, 2; seed 0 of two.
 SCORES = np.array([[1, 2, 3], [1000, 50, 40], [700, 2000, 60], [400, 1500, 3000]])
 GAP = 200  # what seed 1 scores above seed 0
@@ -67,13 +75,7 @@ def write_run(
         "tasks": tasks,
         "episode_length": 10,
         "model_size": {"numbers": 9, "ratio": 2.11},
-        "provenance": {
-            "command": "rewire-jax train",
-            "commit": "abc123",
-            "versions": {"jax": "0.10.2"},
-            "device": "cpu",
-            "started": "2025-01-01T00:00:00",
-        },
+        "provenance": PROVENANCE,
     }
     (folder / "settings.json").write_text(json.dumps(head))
     results = [
@@ -148,6 +150,12 @@ def write_alone(folder: Path, task: str, learning: Sequence[float], **options: A
         learning=np.array([learning]),
         **options,
     )
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV."""
+    with path.open() as file:
+        return list(csv.DictReader(file))
 
 
 def replace_line(path: Path, number: int, text: str) -> None:

@@ -6,8 +6,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-BUDGET = 1000
-TASKS = ("hugefoot", "moon", "carry_stuff")
+from tests.fake_run import BUDGET, PROVENANCE, TASKS
+
 GRID = tuple(
     {"modes": k, "alpha": a, "beta": b}
     for k, a, b in product((1, 2, 3), (0.0, 1e-5), (1.0, 100.0))
@@ -87,13 +87,7 @@ def write_sweep(
         "members": members,
         "tasks": TASKS,
         "episode_length": 10,
-        "provenance": {
-            "command": "rewire-jax sweep",
-            "commit": "abc123",
-            "versions": {"jax": "0.10.2"},
-            "device": "cpu",
-            "started": "2025-01-01T00:00:00",
-        },
+        "provenance": PROVENANCE,
         **(head or {}),
     }
     (folder / "settings.json").write_text(json.dumps(header))

@@ -1,6 +1,9 @@
 """Settings of a run of seconds."""
 
 import dataclasses
+from typing import Any
+
+import pytest
 
 import rewire_jax
 from rewire_jax.core.settings import Settings
@@ -28,6 +31,21 @@ def small(settings: Settings) -> Settings:
         checkpoint_every=320,
         sac=dataclasses.replace(settings.sac, hidden=16, batch_size=32),
     )
+
+
+def shrink_presets(
+    monkeypatch: pytest.MonkeyPatch, hidden: int, **changes: Any
+) -> None:
+    """Makes presets those of a run of seconds, with a single hidden layer."""
+    preset = rewire_jax.preset
+    few = {"envs": 16, "warmup": 160, "eval_episodes": 2, "report_every": 160}
+
+    def shrunk(*arguments: Any) -> Settings:
+        quick = preset(*arguments)
+        sac = dataclasses.replace(quick.sac, hidden=hidden, depth=1, batch_size=8)
+        return dataclasses.replace(quick, sac=sac, **few | changes)
+
+    monkeypatch.setattr(rewire_jax, "preset", shrunk)
 
 
 def flags(settings: Settings) -> list[str]:

@@ -8,8 +8,9 @@ import jax
 from matplotlib.axes import Axes
 
 from experiments.host_loop import simulate
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
 from experiments.speed.timing import Loop, in_turn
+from experiments.suite import Row, show
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.domains import BRAX_BACKENDS
 from rewire_jax.envs.scenarios import make_scenario
@@ -116,9 +117,9 @@ PART = Part(
     "steps a second over a single environment.",
     measure=measure,
     columns={
-        "environment": lambda row: row["environment"],
-        "backend": lambda row: row["backend"],
-        "side by side": show("count", "d"),
+        "environment": show("environment"),
+        "backend": show("backend"),
+        "side by side": show("count"),
         "steps a second, all together": show("steps_per_second", ",.0f"),
         "gain": show("gain", ",.1f"),
     },

@@ -14,9 +14,10 @@ import jax
 import numpy as np
 from matplotlib.axes import Axes
 
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
 from experiments.speed.timing import Loop, Timing, in_turn
 from experiments.speed.updates import METHODS, draw_batches, update_loop
+from experiments.suite import Row, show
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.transition import Batch
 from rewire_jax.envs.scenarios import make_scenario
@@ -192,10 +193,10 @@ PART = Part(
     "peers.",
     measure=measure,
     columns={
-        "implementation": lambda row: row["name"],
+        "implementation": show("name"),
         "version": lambda row: row.get("version") or "not installed",
-        "policy": lambda row: row["policy"],
-        "updates to one of the policy": show("delay", "d"),
+        "policy": show("policy"),
+        "updates to one of the policy": show("delay"),
         "interactions a second": show("interactions_per_second", ",.0f"),
         "updates a second": show("updates_per_second", ",.0f"),
         "our plain loop": _ratio("whole", "plain"),

@@ -3,7 +3,8 @@
 from matplotlib.axes import Axes
 
 from experiments import population
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
+from experiments.suite import Row, show
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.reports import plots
 from rewire_jax.training.presets import preset
@@ -31,10 +32,7 @@ def measure(effort: Effort) -> list[Row]:
 def draw(axes: Axes, rows: list[Row]) -> None:
     """Updates a second of all members together."""
     members = [row["members"] for row in rows]
-    rates = [row["updates_per_second"] for row in rows]
-    axes.plot(members, rates, marker="o", **plots.look(0))
-    plots.doubling(axes, members)
-    axes.set_ylim(0, None)
+    plots.by_size(axes, members, [row["updates_per_second"] for row in rows])
     axes.set_xlabel("members side by side")
     axes.set_ylabel("updates a second, all together")
 
@@ -48,7 +46,7 @@ PART = Part(
     "and memory.",
     measure=measure,
     columns={
-        "members": show("members", "d"),
+        "members": show("members"),
         "updates a second, all together": show("updates_per_second", ",.0f"),
         "gain over the first": show("gain", ".2f"),
         "compile, s": show("compile_seconds", ".0f"),

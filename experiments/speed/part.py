@@ -1,16 +1,15 @@
 """What a part of the bench is, and how much of it is measured."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
 
+from experiments.suite import Columns, Row
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.training.presets import preset
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -55,15 +54,5 @@ class Part(NamedTuple):
     title: str
     reading: str
     measure: Callable[[Effort], list[Row]]
-    columns: Mapping[str, Callable[[Row], str]]
+    columns: Columns
     picture: tuple[str, Callable[[Axes, list[Row]], None]] | None = None
-
-
-def show(name: str, form: str = ",.3g") -> Callable[[Row], str]:
-    """A column: a number of the row, or a dash where it has none."""
-
-    def text(row: Row) -> str:
-        value = row.get(name)
-        return "–" if value is None else format(value, form)
-
-    return text

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from matplotlib.axes import Axes
 
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
 from experiments.speed.timing import Loop, in_turn
+from experiments.suite import Row, show
 from rewire_jax.nn.permutation import permute
 from rewire_jax.reports import plots
 
@@ -96,10 +97,10 @@ PART = Part(
     "scores. Memory is that of temporary arrays, as compiled.",
     measure=measure,
     columns={
-        "n": show("hidden", "d"),
-        "batch": show("batch", "d"),
-        "`permute`, ms": show("permute_ms"),
-        "dense, ms": show("dense_ms"),
+        "n": show("hidden"),
+        "batch": show("batch"),
+        "`permute`, ms": show("permute_ms", ",.3g"),
+        "dense, ms": show("dense_ms", ",.3g"),
         "times faster": show("faster", ".2f"),
         "`permute`, MB": _megabytes("permute"),
         "dense, MB": _megabytes("dense"),

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 from matplotlib.axes import Axes
 
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
 from experiments.speed.timing import in_turn
 from experiments.speed.updates import METHODS, update_loop
+from experiments.suite import Row, show
 from rewire_jax.reports import plots
 
 MODES = (1, 3, 5)
@@ -44,10 +45,7 @@ def draw(axes: Axes, rows: list[Row]) -> None:
     rows = [row for row in rows if row["modes"] == rows[-1]["modes"]]
     rows.sort(key=lambda row: row["hidden"])
     widths = [row["hidden"] for row in rows]
-    costs = [row["cost"] for row in rows]
-    axes.plot(widths, costs, marker="o", **plots.look(0))
-    plots.doubling(axes, widths)
-    axes.set_ylim(0, None)
+    plots.by_size(axes, widths, [row["cost"] for row in rows])
     axes.set_xlabel("neurons in a hidden layer")
     axes.set_ylabel("cost of a rewire update, in plain ones")
 
@@ -58,11 +56,11 @@ PART = Part(
     "their distillation, and the alignment with a previous task.",
     measure=measure,
     columns={
-        "modes K": show("modes", "d"),
-        "width n": show("hidden", "d"),
-        "batch": show("batch", "d"),
-        "plain, a second": show("plain"),
-        "rewire, a second": show("rewire"),
+        "modes K": show("modes"),
+        "width n": show("hidden"),
+        "batch": show("batch"),
+        "plain, a second": show("plain", ",.3g"),
+        "rewire, a second": show("rewire", ",.3g"),
         "cost": show("cost", ".2f"),
     },
     picture=("Cost of rewiring by width, K = 3", draw),

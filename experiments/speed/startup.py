@@ -6,7 +6,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
+from experiments.suite import Row, show
 from rewire_jax.core.settings import require
 
 SETTINGS = {
@@ -74,8 +75,8 @@ PART = Part(
     "selection of one episode each come before.",
     measure=measure,
     columns={
-        "scenario": lambda row: row["scenario"],
-        "compilation cache": lambda row: row["cache"],
+        "scenario": show("scenario"),
+        "compilation cache": show("cache"),
         "seconds": show("seconds", ".1f"),
         "share": show("share", ".0%"),
     },

@@ -53,10 +53,10 @@ class Timing(NamedTuple):
         }
 
 
-def timed(loop: Loop, count: int) -> float:
-    """Seconds that the loop takes."""
+def timed(function: Callable[..., Any], *arguments: Any) -> float:
+    """Seconds until a function's result is ready."""
     start = time.perf_counter()
-    jax.block_until_ready(loop(count))
+    jax.block_until_ready(function(*arguments))
     return time.perf_counter() - start
 
 

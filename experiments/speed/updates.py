@@ -6,9 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from experiments.speed.part import Effort, Part, Row, show
+from experiments.speed.part import Effort, Part
 from experiments.speed.products import SQUARE, multiply_adds, product_loop, products
 from experiments.speed.timing import Loop, in_turn
+from experiments.suite import Row, show
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods import find_method
@@ -131,8 +132,8 @@ PART = Part(
     measure=measure,
     columns={
         "loop": lambda row: f"`{row['loop']}`",
-        "a second, best": show("best"),
-        "median": show("median"),
+        "a second, best": show("best", ",.3g"),
+        "median": show("median", ",.3g"),
         "GFLOP/s": _flops,
         "share": show("share", ".0%"),
         "cost": show("cost", ".2f"),

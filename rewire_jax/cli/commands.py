@@ -16,9 +16,9 @@ from rewire_jax.core.settings import Settings, require
 from rewire_jax.envs.scenarios import Scenario, list_scenarios, make_scenario
 from rewire_jax.methods import METHODS
 from rewire_jax.rendering import render
-from rewire_jax.reports import run_report, sweep_report
+from rewire_jax.reports.report import to_terminal
+from rewire_jax.reports.write import write_report
 from rewire_jax.run import evaluation, sweep, train_run
-from rewire_jax.storage import run_folder
 from rewire_jax.storage.scores import Success
 
 Axes = Annotated[
@@ -131,7 +131,7 @@ class Sweep(Flags):
             log=self.log,
         )
         if jax.process_index() == 0:
-            _show(sweep_report.write_sweep_report(folder))
+            print(to_terminal(write_report([folder], folder)), end="")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,14 +223,10 @@ class Report(Flags):
 
     def __call__(self) -> None:
         """Reports."""
-        if "sweep" in map(run_folder.kind, self.runs):
-            require(len(self.runs) == 1, "give a sweep alone: one report is of it only")
-            _show(sweep_report.write_sweep_report(self.runs[0], self.out))
-            return
-        made = run_report.write_report(
+        made = write_report(
             self.runs, self.out, single=self.single, success=self.success
         )
-        print(run_report.to_terminal(made), end="")
+        print(to_terminal(made), end="")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +285,3 @@ Command = Train | Sweep | Evaluate | Render | Report | Info | List
 COMMANDS: dict[str, type[Command]] = {
     kind.__name__.lower(): kind for kind in get_args(Command)
 }
-
-
-def _show(written: sweep_report.SweepReport) -> None:
-    print(written.title, *written.notes, *written.paths, sep="\n")

@@ -216,6 +216,13 @@ def doubling(axes: Axes, values: Sequence[int]) -> None:
     axes.set_xticks(values, [str(value) for value in values])
 
 
+def by_size(axes: Axes, sizes: Sequence[int], values: Sequence[float]) -> None:
+    """A line of values above 0, by sizes that double."""
+    axes.plot(sizes, values, marker="o", **look(0))
+    doubling(axes, sizes)
+    axes.set_ylim(0, None)
+
+
 def look(i: int) -> dict[str, Any]:
     """Colour and line style of the method at a place, the same in all pictures."""
     style = _STYLES[i // _ALIKE % len(_STYLES)]

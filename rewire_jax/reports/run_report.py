@@ -1,39 +1,30 @@
-"""Tables, pictures and a result file of one or more runs, from their files alone."""
+"""What the report of one or more runs has."""
 
-import io
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from rewire_jax.core.errors import writing
-from rewire_jax.core.settings import require
 from rewire_jax.reports import run_tables
-from rewire_jax.reports.run_summary import (
-    MEASURES,
-    Comparison,
-    Summary,
-    Tasks,
-    summarize,
-)
-from rewire_jax.reports.titles import heading
-from rewire_jax.storage.run_results import RunData, read_run
-from rewire_jax.storage.scores import SUCCESS, Success
+from rewire_jax.reports.data_files import json_text
+from rewire_jax.reports.provenance import origin
+from rewire_jax.reports.report import Report
+from rewire_jax.reports.run_summary import MEASURES, Comparison, Summary, Tasks
+from rewire_jax.reports.table import Table, to_markdown
+from rewire_jax.reports.titles import heading, several
+from rewire_jax.storage.run_results import RunData
 
 _READING = (
-    "Performance is the score at the end, averaged over tasks; values are mean ± "
-    "sample standard deviation over seeds. IQM is the interquartile mean of the tasks' "
-    "scores at the end over all seeds, with its stratified bootstrap interval. "
-    "Forgetting is the score at the end minus the score right after own training: "
-    "negative means forgotten. Training and selection are interactions of each seed; "
-    "hours are those of training."
+    "Performance is the score after the last task, averaged over tasks. Values are "
+    "mean ± sample standard deviation over seeds. IQM is the interquartile mean of "
+    "these scores over tasks and seeds, with its stratified bootstrap interval. "
+    "Forgetting is a task's score at the end minus its score right after own training: "
+    "negative means forgotten. Training and selection are interactions of each seed. "
+    "Hours are those of training."
 )
 _NORMALISED = (
     "÷ SAC-N: performance, IQM, forgetting and transfer are divided by the mean return "
@@ -45,143 +36,52 @@ _CONTINUAL_WORLD = (
     "sign."
 )
 _TRANSFER = (
-    "Forward transfer is Continual World's: (AUC - AUC_b) / (1 - AUC_b) for each task, "
-    "AUC being the success rate of training episodes, averaged over the task's "
-    "interactions (progress reports that saw episodes end, weighted by the "
-    "interactions since the last report), and AUC_b its mean over the seeds of a run "
-    "that learns the task alone. It is undefined where AUC_b is 1."
+    "Forward transfer is Continual World's: (AUC - AUC_b) / (1 - AUC_b) for each task. "
+    "AUC is the success rate of training episodes, averaged over the task's "
+    "interactions: a progress report counts by the interactions since the last one, "
+    "and only if episodes ended. AUC_b is the mean over seeds of the same for a run "
+    "that learns the task alone. Forward transfer is undefined where AUC_b is 1."
 )
 
 
-@dataclass(frozen=True)
-class Report:
-    """What was written, and the numbers in it.
+def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
+    """The report of runs; nothing is written.
 
-    Attributes:
-        title: scenario, profile, budget, backend, seeds.
-        notes: what a reader must know: raw returns, diverged seeds, unfinished runs.
+    Args:
         comparison: the numbers.
-        markdown: the tables for people.
-        csv: a row for each run, in the form of the paper's Table 1.
-        tasks: a row for each run and task.
-        json: the numbers by seed, with every run's settings and provenance.
-        curves: picture of training over the sequence.
-        matrix: picture of task × stage.
-        tradeoff: picture of performance and model size, the paper's Fig. 4.
+        folder: of the report.
     """
-
-    title: str
-    notes: tuple[str, ...]
-    comparison: Comparison
-    markdown: Path
-    csv: Path
-    tasks: Path
-    json: Path
-    curves: Path
-    matrix: Path
-    tradeoff: Path
-
-    @property
-    def summaries(self) -> tuple[Summary, ...]:
-        """The numbers, one entry for each run."""
-        return self.comparison.summaries
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """All files of the report."""
-        data = self.markdown, self.csv, self.tasks, self.json
-        return *data, self.curves, self.matrix, self.tradeoff
-
-
-def write_report(
-    runs: Sequence[str | Path],
-    out: str | Path,
-    *,
-    single: Sequence[str | Path] = (),
-    success: Success = "any",
-) -> Report:
-    """Writes the report of comparable runs.
-
-    Runs that know success are measured by their success rates, others by returns.
-
-    Args:
-        runs: run folders, complete or partial.
-        out: the folder to write into; made where missing, an old report is replaced.
-        single: folders of finished runs that learn one task each, one for every task
-            of the sequence: forward transfer of success rates is measured from them.
-        success: which steps of an episode count: "any", or the "last" alone.
-
-    Raises:
-        UserError: a run cannot be read, the runs are not comparable, a task lacks its
-            single-task run, or `out` cannot be written.
-    """
-    known = ", ".join(SUCCESS)
-    require(success in SUCCESS, f"unknown success {success!r}: choose one of {known}")
-    comparison = summarize(
-        [read_run(run, success) for run in runs],
-        [read_run(run, success) for run in single],
+    title, notes = _title(comparison), tuple(_notes(comparison))
+    results, costs = run_tables.results(comparison), run_tables.costs(comparison)
+    tasks = run_tables.tasks(comparison)
+    rows = [[*r, *c[1:]] for r, c in zip(results.rows, costs.rows, strict=True)]
+    return Report(
+        folder=folder,
+        name="report.md",
+        title=title,
+        notes=notes,
+        numbers=comparison,
+        table=Table([*results.heads, *costs.heads[1:]], rows),
+        # A terminal is too narrow for all columns side by side.
+        shown=(tasks, costs, results),
+        reading=tuple(_reading(comparison)),
+        texts={
+            "report.csv": run_tables.results_csv(comparison),
+            "tasks.csv": run_tables.tasks_csv(comparison),
+            "result.json": _json(comparison, title, notes),
+        },
+        pictures={
+            "tradeoff.png": "Performance and model size",
+            "curves.png": "Learning curves",
+            "matrix.png": "Matrix",
+        },
+        draw=partial(_draw, comparison, title),
+        details=to_markdown(*tasks),
+        origins=[
+            *(origin(each.label, each.run) for each in comparison.summaries),
+            *(origin(f"{run.tasks[0]} alone", run) for run in comparison.single),
+        ],
     )
-    out = Path(out)
-    report = Report(
-        title=_title(comparison.summaries),
-        notes=tuple(_notes(comparison)),
-        comparison=comparison,
-        markdown=out / "report.md",
-        csv=out / "report.csv",
-        tasks=out / "tasks.csv",
-        json=out / "result.json",
-        curves=out / "curves.png",
-        matrix=out / "matrix.png",
-        tradeoff=out / "tradeoff.png",
-    )
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        report.markdown.write_text(_markdown(report), encoding="utf-8")
-        report.csv.write_text(run_tables.results_csv(comparison), encoding="utf-8")
-        report.tasks.write_text(run_tables.tasks_csv(comparison), encoding="utf-8")
-        report.json.write_text(_json(report), encoding="utf-8")
-        _draw(report)
-    return report
-
-
-def to_terminal(report: Report, width: int = 100) -> str:
-    """The report's tables as plain text, for a command to print.
-
-    Args:
-        report: what `write_report` gave.
-        width: columns to fill at most.
-    """
-    file = io.StringIO()
-    console = Console(file=file, width=width, color_system=None, force_terminal=False)
-    console.print(Text(report.title))
-    # A terminal shows the end best, and is too narrow for all columns side by side.
-    for make in (run_tables.tasks, run_tables.costs, run_tables.results):
-        heads, rows = make(report.comparison)
-        table = Table(
-            box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True
-        )
-        for k, head in enumerate(heads):
-            if head in run_tables.WORDS:
-                table.add_column(head, overflow="fold")
-            else:
-                # The heading breaks between words, so that numbers need not.
-                texts = head.split() + [row[k] for row in rows]
-                table.add_column(head, justify="right", width=max(map(len, texts)))
-        last = ""
-        for method, *cells in rows:
-            # A method is named once, at its first task.
-            table.add_row(Text("" if method == last else method), *map(Text, cells))
-            last = method
-        console.print()
-        console.print(table)
-    console.print()
-    for note in (*_reading(report.comparison), *report.notes):
-        console.print(Text(note))
-    console.print()
-    for path in report.paths:
-        # A path that is wrapped cannot be copied.
-        console.print(Text(str(path)), soft_wrap=True)
-    return file.getvalue()
 
 
 def _reading(comparison: Comparison) -> Iterator[str]:
@@ -199,12 +99,10 @@ def _reading(comparison: Comparison) -> Iterator[str]:
         yield f"The paper's columns are its published results, {made}."
 
 
-def _title(summaries: Sequence[Summary]) -> str:
-    run = summaries[0].run
-    counts = sorted({len(summary.run.seeds) for summary in summaries})
-    seeds = " to ".join(str(count) for count in sorted({counts[0], counts[-1]}))
-    members = f"{seeds} seed{'' if counts[-1] == 1 else 's'}"
-    return heading(run.settings["scenario"], run.settings, len(run.tasks), members)
+def _title(comparison: Comparison) -> str:
+    runs = [summary.run for summary in comparison.summaries]
+    first, seeds = runs[0], [len(run.seeds) for run in runs]
+    return heading(first.settings["scenario"], first.settings, len(first.tasks), seeds)
 
 
 def _notes(comparison: Comparison) -> Iterator[str]:
@@ -213,11 +111,9 @@ def _notes(comparison: Comparison) -> Iterator[str]:
     for summary in comparison.summaries:
         run = summary.run
         if run.diverged:
-            names = ", ".join(str(seed) for seed in run.diverged)
-            some = f"seed {names} diverged and is"
-            if len(run.diverged) > 1:
-                some = f"seeds {names} diverged and are"
-            yield f"{summary.label}: {some} left out of all means and pictures."
+            lost = several(len(run.diverged), "diverged seed")
+            names = ", ".join(map(str, run.diverged))
+            yield f"{summary.label}: {lost} left out of means and pictures: {names}."
         if not run.complete:
             end = "there are no results after training yet"
             if run.finished:
@@ -225,69 +121,30 @@ def _notes(comparison: Comparison) -> Iterator[str]:
                     f'"{MEASURES["end"]}" is after task {run.finished}, and means are '
                     "over the tasks trained by then"
                 )
-            done = f"{run.finished} of {len(run.tasks)} tasks"
+            done = f"{run.finished} of {several(len(run.tasks), 'task')}"
             yield f"{summary.label}: unfinished, {done}; {end}."
 
 
-def _draw(report: Report) -> None:
+def _draw(comparison: Comparison, title: str, folder: Path) -> None:
     # Here, because Matplotlib takes long to import.
     from rewire_jax.reports import plots
     from rewire_jax.reports.tradeoff_plot import Point, tradeoff
 
-    def line(summary: Summary) -> plots.Line:
-        run, kept = summary.run, summary.run.kept
+    lines, points = [], []
+    for summary in comparison.summaries:
+        run, kept, value = summary.run, summary.run.kept, summary.performance
         scores = np.concatenate([run.before[:, None], run.scores], axis=1)
         curve = [(x, values[kept]) for x, values in run.curve]
-        return plots.Line(summary.label, curve, scores[kept])
-
-    def point(summary: Summary) -> Point:
-        value = summary.performance
+        lines.append(plots.Line(summary.label, curve, scores[kept]))
         mean = math.nan if value.mean is None else value.mean
-        return Point(summary.label, summary.run.model_size, mean, value.std)
-
-    comparison, title = report.comparison, report.title
-    score, run = comparison.score, report.summaries[0].run
-    budget = int(run.settings["interactions"])
-    lines = [line(summary) for summary in report.summaries]
-    plots.curves(lines, run.tasks, budget, score, title, report.curves)
-    plots.matrices(lines, run.tasks, score, title, report.matrix)
-    points = [point(summary) for summary in report.summaries]
-    tradeoff(points, comparison.unit, title, report.tradeoff)
+        points.append(Point(summary.label, run.model_size, mean, value.std))
+    score, budget = comparison.score, int(run.settings["interactions"])
+    tradeoff(points, comparison.unit, title, folder / "tradeoff.png")
+    plots.curves(lines, run.tasks, budget, score, title, folder / "curves.png")
+    plots.matrices(lines, run.tasks, score, title, folder / "matrix.png")
 
 
-def _markdown(report: Report) -> str:
-    comparison = report.comparison
-    lines = [f"# {report.title}", ""]
-    for note in report.notes:
-        lines += [f"**{note}**", ""]
-    results, costs = run_tables.results(comparison), run_tables.costs(comparison)
-    lines += run_tables.markdown(
-        results.heads + costs.heads[1:],
-        [row + more[1:] for row, more in zip(results.rows, costs.rows, strict=True)],
-    )
-    for note in _reading(comparison):
-        lines += [note, ""]
-    for name, path in (
-        ("Performance and model size", report.tradeoff),
-        ("Learning curves", report.curves),
-        ("Matrix", report.matrix),
-    ):
-        lines += [f"![{name}]({path.name})", ""]
-    lines += run_tables.markdown(*run_tables.tasks(comparison))
-    lines += [_origin(summary.label, summary.run) for summary in report.summaries]
-    lines += [_origin(f"{run.tasks[0]} alone", run) for run in comparison.single]
-    return "\n".join(lines) + "\n"
-
-
-def _origin(label: str, run: RunData) -> str:
-    seeds = ", ".join(str(seed) for seed in run.seeds)
-    facts = [
-        f"{key} `{run.provenance.get(key)}`" for key in ("command", "commit", "started")
-    ]
-    return f"- {label}: `{run.folder}`, seeds {seeds}, {', '.join(facts)}"
-
-
-def _json(report: Report) -> str:
+def _json(comparison: Comparison, title: str, notes: tuple[str, ...]) -> str:
     runs = [
         {
             "label": summary.label,
@@ -312,22 +169,22 @@ def _json(report: Report) -> str:
                 theirs
                 and {"table": source.table, "of": source.name, **theirs._asdict()}
                 for source, theirs in zip(
-                    report.comparison.sources, summary.published, strict=True
+                    comparison.sources, summary.published, strict=True
                 )
             ],
             "settings": summary.run.settings,
             "provenance": summary.run.provenance,
         }
-        for summary in report.summaries
+        for summary in comparison.summaries
     ]
     data = {
         "format": 2,
-        "title": report.title,
-        "notes": report.notes,
-        "unit": report.comparison.unit,
+        "title": title,
+        "notes": notes,
+        "unit": comparison.unit,
         "runs": runs,
     }
-    if report.comparison.single:
+    if comparison.single:
         data["single"] = [
             {
                 "task": run.tasks[0],
@@ -336,9 +193,9 @@ def _json(report: Report) -> str:
                 "settings": run.settings,
                 "provenance": run.provenance,
             }
-            for run in report.comparison.single
+            for run in comparison.single
         ]
-    return run_tables.json_text(data)
+    return json_text(data)
 
 
 def _tasks_json(run: RunData, tasks: Tasks) -> list[dict[str, Any]]:

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from rewire_jax.core.errors import UserError
 from rewire_jax.reports import metrics, paper_results
 from rewire_jax.reports.paper_results import Figures, Source
+from rewire_jax.reports.spread import Interval, Spread, spread
 from rewire_jax.storage.run_results import RunData
 from rewire_jax.storage.scores import Score
 
 Array = NDArray[np.float64]
-Tasks = tuple[dict[str, "Spread"], ...]
+Tasks = tuple[dict[str, Spread], ...]
 
 # Runs that differ in one of these are not comparable and share no table; with what
 # earlier runs had, where they do not say.
@@ -32,30 +33,6 @@ MEASURES = {
     "end": "at the end",
     "forgetting": "forgetting",
 }
-
-
-@dataclass(frozen=True)
-class Spread:
-    """A value over seeds.
-
-    Attributes:
-        values: one a seed, NaN where missing.
-        mean: None without values.
-        std: the sample standard deviation, None with fewer than two seeds.
-    """
-
-    values: tuple[float, ...]
-    mean: float | None
-    std: float | None
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A value with its 95% interval, None where there is none."""
-
-    value: float | None
-    low: float | None
-    high: float | None
 
 
 @dataclass(frozen=True)
@@ -167,20 +144,6 @@ def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Compar
         theirs = tuple(s.results.get(method) if alone else None for s in sources)
         summaries.append(_summary(run, label, base, areas, theirs))
     return Comparison(tuple(summaries), first.score, sources, raw, tuple(single))
-
-
-def spread(values: Array) -> Spread:
-    """Mean and sample standard deviation over seeds.
-
-    Args:
-        values: `[seeds]`; NaN is passed over.
-    """
-    there = values[~np.isnan(values)]
-    return Spread(
-        values=tuple(values.tolist()),
-        mean=float(there.mean()) if there.size else None,
-        std=float(there.std(ddof=1)) if there.size > 1 else None,
-    )
 
 
 def _check(run: RunData, other: RunData, *names: str) -> None:

@@ -1,32 +1,19 @@
-"""A report's numbers as rows of text, for Markdown, terminal and CSV."""
+"""Numbers of runs as rows of text, for Markdown, terminal and CSV."""
 
-import csv
-import io
-import json
-import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from rewire_jax.core.formatting import number
+from rewire_jax.reports.data_files import csv_text
 from rewire_jax.reports.paper_results import Figures
-from rewire_jax.reports.run_summary import Comparison, Interval, Spread, Summary
-
-# Columns of words are set to the left, all others to the right.
-WORDS = frozenset(("method", "task", "seeds", "device", "fault"))
-
-
-class Table(NamedTuple):
-    """Headings, and rows as long; the first column names the run."""
-
-    heads: tuple[str, ...]
-    rows: list[list[str]]
+from rewire_jax.reports.run_summary import Comparison, Summary
+from rewire_jax.reports.table import Table
 
 
 def tasks(comparison: Comparison) -> Table:
     """A row for each run and task, not normalised; tasks count from 1."""
     measures = comparison.measures
     rows = [
-        [summary.label, f"{k} {name}", *(spread(task[measure]) for measure in measures)]
+        [summary.label, f"{k} {name}", *(str(task[measure]) for measure in measures)]
         for summary in comparison.summaries
         for k, (name, task) in enumerate(
             zip(summary.run.tasks, summary.tasks, strict=True), 1
@@ -51,8 +38,8 @@ def results(comparison: Comparison) -> Table:
     for summary in comparison.summaries:
         row = [
             summary.label,
-            spread(summary.performance),
-            interval(summary.iqm),
+            str(summary.performance),
+            str(summary.iqm),
             f"{summary.run.model_size:.2f}",
         ]
         for source, theirs in zip(comparison.sources, summary.published, strict=True):
@@ -69,8 +56,8 @@ def costs(comparison: Comparison) -> Table:
     rows = [
         [
             summary.label,
-            spread(summary.forgetting),
-            *([spread(summary.transfer)] if transferred else []),
+            str(summary.forgetting),
+            *([str(summary.transfer)] if transferred else []),
             f"{summary.run.training:,}",
             f"{summary.run.selection:,}",
             number(summary.run.hours),
@@ -99,15 +86,12 @@ def results_csv(comparison: Comparison) -> str:
     return csv_text(
         [
             {"method": summary.label, "unit": comparison.unit}
-            | columns("performance", summary.performance)
-            | {
-                "iqm": summary.iqm.value,
-                "iqm_low": summary.iqm.low,
-                "iqm_high": summary.iqm.high,
-            }
-            | columns("forgetting", summary.forgetting)
+            | summary.performance.columns("performance")
+            | {"iqm": summary.iqm.value}
+            | summary.iqm.columns("iqm")
+            | summary.forgetting.columns("forgetting")
             | (
-                columns("forward_transfer", summary.transfer)
+                summary.transfer.columns("forward_transfer")
                 if comparison.transferred
                 else {}
             )
@@ -139,7 +123,7 @@ def tasks_csv(comparison: Comparison) -> str:
             for prefix, tasks in {"": summary.tasks, **summary.others}.items():
                 for measure, value in tasks[k].items():
                     column = f"{prefix}_{measure}" if prefix else measure
-                    row |= columns(column, value)
+                    row |= value.columns(column)
             rows.append(row)
     return csv_text(rows)
 
@@ -161,48 +145,6 @@ def run_values(summary: Summary) -> dict[str, Any]:
     }
 
 
-def csv_text(rows: Sequence[dict[str, Any]]) -> str:
-    """CSV of rows that all have the same columns; None and NaN are left empty."""
-    file = io.StringIO()
-    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(_without_nan(rows))
-    return file.getvalue()
-
-
-def json_text(data: Any) -> str:
-    """JSON, with null for what is not finite."""
-    return json.dumps(_without_nan(data), indent=1, allow_nan=False) + "\n"
-
-
-def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table in Markdown, the last one empty."""
-    rule = ["---" if head in WORDS else "---:" for head in heads]
-    return [*(f"| {' | '.join(row)} |" for row in (heads, rule, *rows)), ""]
-
-
-def columns(name: str, value: Spread) -> dict[str, Any]:
-    """Mean and standard deviation as columns of a CSV."""
-    return {f"{name}_mean": value.mean, f"{name}_std": value.std}
-
-
-def spread(value: Spread) -> str:
-    """Mean ± standard deviation."""
-    if value.mean is None or value.std is None:
-        return number(value.mean)
-    scale = max(abs(value.mean), value.std)
-    return f"{number(value.mean, scale)} ± {number(value.std, scale)}"
-
-
-def interval(value: Interval) -> str:
-    """A value and the ends of its interval."""
-    if value.low is None or value.high is None:
-        return number(value.value)
-    scale = max(abs(value.low), abs(value.high))
-    ends = f"[{number(value.low, scale)}, {number(value.high, scale)}]"
-    return f"{number(value.value, scale)} {ends}"
-
-
 def _memory(summary: Summary) -> str:
     held = [f"{bytes / 1e9:.2f} GB ({of})" for of, bytes in summary.run.memory.items()]
     return held[0] if held else "–"
@@ -212,11 +154,3 @@ def _seeds(summary: Summary) -> str:
     run = summary.run
     count = len(run.seeds)
     return f"{run.kept.sum()} of {count}" if run.diverged else str(count)
-
-
-def _without_nan(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {key: _without_nan(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_without_nan(value) for value in data]
-    return None if isinstance(data, float) and not math.isfinite(data) else data

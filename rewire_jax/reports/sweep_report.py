@@ -1,115 +1,69 @@
-"""Tables, a picture and a result file of a sweep, from its files alone."""
+"""What the report of a sweep has."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from rewire_jax.core.errors import writing
-from rewire_jax.reports import run_tables, sweep_tables
-from rewire_jax.reports.sweep_summary import (
-    Configuration,
-    Panel,
-    SweepSummary,
-    summarize_sweep,
-)
+from rewire_jax.reports import sweep_tables
+from rewire_jax.reports.data_files import json_text
+from rewire_jax.reports.provenance import origin
+from rewire_jax.reports.report import Report
+from rewire_jax.reports.sweep_summary import Configuration, Panel, SweepSummary
 from rewire_jax.reports.sweep_tables import UNIT, settings_text
-from rewire_jax.reports.titles import heading
-from rewire_jax.storage.sweep_results import read_sweep
+from rewire_jax.reports.table import to_markdown
+from rewire_jax.reports.titles import heading, several
 
 _READING = (
     "Performance is the return of deterministic evaluations, averaged over the tasks "
-    "trained by then: mean ± sample standard deviation over seeds, and the mean's "
-    "bootstrap interval over seeds, too narrow where these are few. Configurations are "
-    "ranked by other episodes than those reported, so that the best's performance is "
-    "free of their luck, though not of its seeds'. Those that came further stand "
-    "before the others, among them those with fewer diverged seeds, among these those "
-    "of higher mean. A diverged seed is left out of means. The tables by value are of "
-    "the configurations that came as far as any, their means ± the standard deviation "
-    "over them."
+    "trained by then: mean ± sample standard deviation over seeds, and the mean with "
+    "its bootstrap interval over seeds, which is too narrow where seeds are few. "
+    "Configurations are ranked by other episodes than those of their performance, so "
+    "the best one's performance is not raised by lucky episodes; it may be by lucky "
+    "seeds. Those that trained more tasks come first, then those with fewer diverged "
+    "seeds, then those with a higher mean. Means leave diverged seeds out. The tables "
+    "for single settings show means ± standard deviation over the configurations that "
+    "trained the most tasks."
 )
 
 
-@dataclass(frozen=True)
-class SweepReport:
-    """What was written, and the numbers in it.
-
-    Attributes:
-        title: scenario, method, profile, budget, backend, members.
-        notes: what a reader must know: the best settings and what is as good, what is
-            unfinished, halved away or diverged.
-        summary: the numbers.
-        markdown: the tables for people.
-        members: CSV, a row for each member and stage.
-        configurations: CSV, a row for each configuration, the best first.
-        json: all numbers, with settings and provenance.
-        picture: performance along each axis, the paper's Fig. 6.
-    """
-
-    title: str
-    notes: tuple[str, ...]
-    summary: SweepSummary
-    markdown: Path
-    members: Path
-    configurations: Path
-    json: Path
-    picture: Path
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """All files of the report."""
-        data = self.markdown, self.members, self.configurations, self.json
-        return *data, self.picture
-
-
-def write_sweep_report(
-    folder: str | Path, out: str | Path | None = None
-) -> SweepReport:
-    """Writes the report of a sweep, finished or not.
+def make(summary: SweepSummary, folder: Path) -> Report[SweepSummary]:
+    """The report of a sweep; nothing is written.
 
     Args:
-        folder: of the sweep.
-        out: the folder to write into, by default the sweep's; an old report is
-            replaced.
-
-    Raises:
-        UserError: the sweep cannot be read or has no results yet, or `out` cannot be
-            written.
+        summary: the numbers.
+        folder: of the report.
     """
-    summary = summarize_sweep(read_sweep(folder))
-    out = Path(folder if out is None else out)
-    report = SweepReport(
-        title=_title(summary),
-        notes=tuple(_notes(summary)),
-        summary=summary,
-        markdown=out / "sweep.md",
-        members=out / "members.csv",
-        configurations=out / "configurations.csv",
-        json=out / "sweep.json",
-        picture=out / "panels.png",
+    title, notes = _title(summary), tuple(_notes(summary))
+    ranking = sweep_tables.ranking(summary)
+    return Report(
+        folder=folder,
+        name="sweep.md",
+        title=title,
+        notes=notes,
+        numbers=summary,
+        table=ranking,
+        shown=(ranking,),
+        reading=(_READING,),
+        texts={
+            "members.csv": sweep_tables.members_csv(summary),
+            "configurations.csv": sweep_tables.configurations_csv(summary),
+            "sweep.json": _json(summary, title, notes),
+        },
+        pictures={"panels.png": "Performance along each axis"},
+        draw=partial(_draw, summary, title),
+        details=list(_details(summary)),
+        origins=list(_origins(summary)),
     )
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        text = sweep_tables.members_csv(summary)
-        report.members.write_text(text, encoding="utf-8")
-        text = sweep_tables.configurations_csv(summary)
-        report.configurations.write_text(text, encoding="utf-8")
-        report.markdown.write_text(_markdown(report), encoding="utf-8")
-        report.json.write_text(_json(report), encoding="utf-8")
-        _draw(report)
-    return report
 
 
 def _title(summary: SweepSummary) -> str:
     sweep = summary.sweep
     subject = f"{sweep.settings['scenario']}, {sweep.settings['method']}"
-    configurations, seeds = len(summary.configurations), len(set(sweep.seeds.tolist()))
-    members = f"{configurations} configurations"
-    if configurations == 1:
-        members = "1 configuration"
-    members += f" × {seeds} seed{'' if seeds == 1 else 's'}"
-    return heading(subject, sweep.settings, len(sweep.tasks), members)
+    count, seeds = len(summary.configurations), len(set(sweep.seeds.tolist()))
+    return heading(subject, sweep.settings, len(sweep.tasks), [seeds], count)
 
 
 def _notes(summary: SweepSummary) -> Iterator[str]:
@@ -118,25 +72,24 @@ def _notes(summary: SweepSummary) -> Iterator[str]:
         yield "There is no best configuration yet: no seed of any is left or evaluated."
     else:
         count = len(best.kept)
+        trust = f"95% interval of {count} seeds."
+        if count == 1:
+            trust = "of one seed, which tells settings apart by chance."
         yield (
             f"Best: {settings_text(best.values)}; performance after "
-            f"{_tasks(best.stage)} {run_tables.interval(best.interval)}, "
-            + (
-                "of one seed, which tells settings apart by chance."
-                if count == 1
-                else f"95% interval of {count} seeds."
-            )
+            f"{several(best.stage, 'task')} {best.interval}, {trust}"
         )
         found = len(summary.contenders)
         if found:
+            overlap = "overlaps" if found == 1 else "overlap"
             yield (
-                f"Others whose interval reaches its own: {found}. This sweep does not "
-                "tell these apart."
+                f"{several(found, 'other configuration')} {overlap} the best one's "
+                "interval: this sweep does not tell them apart."
             )
     if not sweep.complete:
         yield (
-            f"Unfinished: {sweep.finished} of {_tasks(len(sweep.tasks))} are trained "
-            "and evaluated for all members."
+            f"Unfinished: {sweep.finished} of {several(len(sweep.tasks), 'task')} are "
+            "trained and evaluated for all members."
         )
     stopped = sum(each.stopped for each in summary.configurations)
     if stopped:
@@ -146,29 +99,18 @@ def _notes(summary: SweepSummary) -> Iterator[str]:
         )
     lost = sum(len(each.diverged) for each in summary.configurations)
     if lost:
-        some = "1 member" if lost == 1 else f"{lost} members"
-        yield f"{some} of {len(sweep.seeds)} diverged."
+        yield f"{several(lost, 'member')} of {len(sweep.seeds)} diverged."
 
 
-def _tasks(count: int) -> str:
-    return f"{count} task{'' if count == 1 else 's'}"
-
-
-def _markdown(report: SweepReport) -> str:
-    summary = report.summary
-    lines = [f"# {report.title}", ""]
-    for note in report.notes:
-        lines += [f"**{note}**", ""]
-    lines += run_tables.markdown(*sweep_tables.ranking(summary))
-    picture = f"![Performance along each axis]({report.picture.name})"
-    lines += [_READING, "", picture, "", _reading(summary), ""]
+def _details(summary: SweepSummary) -> Iterator[str]:
+    yield from (_reading(summary), "")
     for panel in summary.panels:
-        lines += [f"## {panel.axis}", ""]
-        lines += run_tables.markdown(*sweep_tables.values(summary, panel))
+        yield from (f"## {panel.axis}", "")
+        yield from to_markdown(*sweep_tables.values(summary, panel))
     lost = sweep_tables.lost(summary)
     if lost.rows:
-        lines += ["## What diverged", "", *run_tables.markdown(*lost)]
-    return "\n".join([*lines, "## How it was made", "", *_origin(summary)]) + "\n"
+        yield from ("## Diverged", "", *to_markdown(*lost))
+    yield from ("## Origin", "")
 
 
 def _reading(summary: SweepSummary) -> str:
@@ -191,11 +133,9 @@ def _reading(summary: SweepSummary) -> str:
     return f"{text}; the other axes {where}: {settings_text(centre)}."
 
 
-def _draw(report: SweepReport) -> None:
+def _draw(summary: SweepSummary, title: str, folder: Path) -> None:
     # Here, because Matplotlib takes long to import.
     from rewire_jax.reports.sensitivity_plot import Dot, panels
-
-    summary = report.summary
 
     def dot(panel: Panel, each: Configuration) -> Dot:
         mean = each.performance.mean
@@ -210,40 +150,32 @@ def _draw(report: SweepReport) -> None:
     panels(
         [(p.axis, [dot(p, each) for each in p.line]) for p in summary.panels],
         UNIT,
-        report.title,
+        title,
         _reading(summary),
-        report.picture,
+        folder / "panels.png",
         joined=not summary.sweep.random,
     )
 
 
-def _origin(summary: SweepSummary) -> list[str]:
-    """Where the numbers come from."""
+def _origins(summary: SweepSummary) -> Iterator[str]:
     sweep = summary.sweep
-    made = sweep.provenance
-    versions = ", ".join(f"{k} {v}" for k, v in dict(made.get("versions", {})).items())
-    seeds = ", ".join(str(seed) for seed in sorted(set(sweep.seeds.tolist())))
+    yield origin(several(len(sweep.seeds), "member"), sweep)
     training, selection = (
         int(np.nanmax(values, axis=1, initial=0).sum())
         for values in (sweep.training, sweep.selection)
     )
-    return [
-        f"- `{sweep.folder}`: {len(sweep.seeds)} members, seeds {seeds}",
-        *(f"- {key} `{made.get(key)}`" for key in ("command", "commit", "started")),
-        f"- device: {made.get('device')}; versions: {versions}",
-        f"- {int(sweep.settings['interactions']):,} interactions a task; all members "
-        f"together {training:,} of training and {selection:,} of selection, in "
-        f"{sweep.hours:.2f} hours of training",
-    ]
+    yield (
+        f"- all members together: {training:,} interactions of training and "
+        f"{selection:,} of selection, in {sweep.hours:.2f} hours of training"
+    )
 
 
-def _json(report: SweepReport) -> str:
-    summary = report.summary
+def _json(summary: SweepSummary, title: str, notes: tuple[str, ...]) -> str:
     sweep = summary.sweep
     data = {
         "format": 1,
-        "title": report.title,
-        "notes": report.notes,
+        "title": title,
+        "notes": notes,
         "unit": UNIT,
         "tasks": sweep.tasks,
         "finished_tasks": sweep.finished,
@@ -278,4 +210,4 @@ def _json(report: SweepReport) -> str:
         "settings": sweep.settings,
         "provenance": sweep.provenance,
     }
-    return run_tables.json_text(data)
+    return json_text(data)

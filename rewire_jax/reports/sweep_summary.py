@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from rewire_jax.reports import metrics
-from rewire_jax.reports.run_summary import Interval, Spread, spread
+from rewire_jax.reports.spread import Interval, Spread, spread
 from rewire_jax.run.ranking import rank
-from rewire_jax.storage.sweep_results import Array, SweepData
+from rewire_jax.storage.result_files import Array
+from rewire_jax.storage.sweep_results import SweepData
 
 
 @dataclass(frozen=True)

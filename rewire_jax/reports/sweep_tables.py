@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 
 from rewire_jax.core.formatting import short
-from rewire_jax.reports.run_summary import spread
-from rewire_jax.reports.run_tables import Table, columns, csv_text, interval
-from rewire_jax.reports.run_tables import spread as shown
+from rewire_jax.reports.data_files import csv_text
+from rewire_jax.reports.spread import spread
 from rewire_jax.reports.sweep_summary import (
     Configuration,
     Panel,
     SweepSummary,
     performance,
 )
+from rewire_jax.reports.table import Table
 
 UNIT = "raw return"
 _SHOWN = 10  # configurations in a table for people
@@ -30,9 +30,9 @@ def ranking(summary: SweepSummary) -> Table:
         [
             str(place),
             *_cells(each),
-            shown(each.performance),
-            interval(each.interval),
-            shown(each.choice),
+            str(each.performance),
+            str(each.interval),
+            str(each.choice),
             f"{len(each.kept)} of {len(each.members)}",
             str(each.stage),
         ]
@@ -66,11 +66,11 @@ def values(summary: SweepSummary, panel: Panel) -> Table:
         over = spread(np.array([m for m in means if m is not None], np.float64))
         ends = [short(x) for x in sorted({part[0], part[-1]})]
         row = [" to ".join(ends), f"{len(level)} of {len(there)}"]
-        row += [shown(over)]
-        row += [shown(level[0].performance) if level else "–"]
+        row += [str(over)]
+        row += [str(level[0].performance) if level else "–"]
         if not summary.sweep.random:
             alone = [e for e in panel.line if e.values[axis] in part and e in level]
-            row += [shown(alone[0].performance) if alone else "–"]
+            row += [str(alone[0].performance) if alone else "–"]
         rows.append(row)
     heads = [axis, "configurations", "mean over these", "the best of these"]
     if not summary.sweep.random:
@@ -132,9 +132,9 @@ def _row(each: Configuration) -> dict[str, Any]:
             "seeds": len(each.kept),
             "diverged": len(each.diverged),
         }
-        | columns("performance", each.performance)
-        | {"performance_low": each.interval.low, "performance_high": each.interval.high}
-        | columns("choice", each.choice)
+        | each.performance.columns("performance")
+        | each.interval.columns("performance")
+        | each.choice.columns("choice")
     )
 
 

@@ -248,7 +248,7 @@ def sweep(
       progress: makes the display.
 
     Returns:
-      The folder; see this module for what it holds, and `write_sweep_report`.
+      The folder; see this module for what it holds, and `write_report`.
 
     Raises:
       UserError: settings that make no sense, a folder that does not fit, a full disk.

@@ -9,24 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.storage.json_lines import document, index, number, reading, table
-from rewire_jax.storage.run_results import Head, read_head, result, times
+from rewire_jax.storage.json_lines import document, index, reading
+from rewire_jax.storage.result_files import (
+    Array,
+    Flags,
+    Results,
+    Rows,
+    read_evaluations,
+    read_header,
+    read_timing,
+    to_arrays,
+)
+from rewire_jax.storage.run_folder import HEADER
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Whole = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class SweepData:
+class SweepData(Results):
     """What a sweep has written so far, of M members, T stages and as many tasks.
 
+    It also has the attributes of `Results`.
+
     Attributes:
-        folder: the sweep's folder.
-        settings: the resolved settings that all members share.
-        tasks: names of the whole sequence, T of them.
-        provenance: command, commit, versions, device and start time.
-        episode_length: steps to the time limit.
         random: how many configurations were drawn; 0 for a grid or a list.
         halving: of this many configurations, one goes on to the next task.
         axes: values of the members by name, `[M]` each.
@@ -41,15 +46,9 @@ class SweepData:
         model_size: numbers stored ÷ those of one policy, `[M, T]`, NaN where missing.
         training: interactions spent on training since the beginning, in the same form.
         selection: the same of choosing and rolling back.
-        hours: wall clock of training all members, with compilation, without selection
-            and evaluation.
+        hours: of all members together, see `Timing`.
     """
 
-    folder: Path
-    settings: dict[str, Any]
-    tasks: tuple[str, ...]
-    provenance: dict[str, Any]
-    episode_length: int
     random: int
     halving: int
     axes: dict[str, Array]
@@ -102,77 +101,61 @@ def read_sweep(folder: str | Path) -> SweepData:
     Raises:
         UserError: a file is missing, or damaged elsewhere than in its last line.
     """
-    folder = Path(folder)
-    path = folder / "settings.json"
-    head = read_head(path)
-    drawn, halving, axes, configurations, seeds = _design(path, head)
-    count, tasks = len(seeds), len(head.tasks)
-    trained = np.zeros((count, tasks), bool)
-    seen, diverged = (np.zeros((count, tasks, tasks), bool) for _ in range(2))
-    scores, choice = (np.full((count, tasks, tasks), np.nan) for _ in range(2))
-    facts = np.full((3, count, tasks), np.nan)
-    hours = 0.0
+    head = read_header(Path(folder), "sweep")
+    design = _design(head)
+    count, tasks = len(design["seeds"]), len(head.tasks)
+    trained, hours = np.zeros((count, tasks), bool), 0.0
+    rows: Rows = {}
 
-    def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], dict[str, Any]]:
-        (stage, task, _), values = result(row, tasks)
-        key = index(row, "member", 0, count), stage, task
-        return key, values | {"choice": number(row["choice"])}
+    def member(row: dict[str, Any]) -> int:
+        return index(row, "member", 0, count)
 
-    for now, place, members in _batches(folder, count, tasks):
+    for now, place, members in _batches(head.folder, count, tasks):
         trained[members, now] = True
-        hours += times(place / "timing.jsonl", tasks, len(members), False)[0]
-        rows = table(place / "results.jsonl", parse, needed=False)
-        for (member, stage, task), row in rows.items():
-            if stage < 0:  # before any training
-                continue
-            at = member, stage, task
-            seen[at], diverged[at] = True, row["diverged"]
-            scores[at], choice[at] = row["return"], row["choice"]
-            facts[:, member, stage] = row["model_size"], *row["interactions"]
-    evaluated: Flags = np.all(seen, axis=2)
+        hours += read_timing(place / "timing.jsonl", tasks, len(members), False).hours
+        rows |= read_evaluations(
+            place / "results.jsonl", tasks, member, also=("choice",), needed=False
+        )
+    values = to_arrays(rows, range(count), tasks)
+    # What was before any training is left out.
+    values = {name: array[:, 1:] for name, array in values.items()}
+    evaluated: Flags = np.all(~np.isnan(values["diverged"]), axis=2)
     if not evaluated.any():
         raise UserError(f"{folder} holds no results after training yet")
+    # Facts of a member are the same for all tasks of an evaluation.
+    facts = {
+        name: np.fmax.reduce(values[name], axis=2)
+        for name in ("diverged", "model_size", "training", "selection")
+    }
     return SweepData(
-        folder=folder,
-        settings=head.settings,
-        tasks=head.tasks,
-        provenance=head.provenance,
-        episode_length=head.episode_length,
-        random=drawn,
-        halving=halving,
-        axes=axes,
-        configurations=configurations,
-        seeds=seeds,
+        **vars(head),
+        **design,
         trained=trained,
         evaluated=evaluated,
-        diverged=np.logical_or.accumulate(diverged.any(axis=2), axis=1),
-        scores=scores,
-        choice=choice,
-        model_size=facts[0],
-        training=facts[1],
-        selection=facts[2],
+        diverged=np.logical_or.accumulate(facts.pop("diverged") == 1, axis=1),
+        scores=values["return"],
+        choice=values["choice"],
+        **facts,
         hours=hours,
     )
 
 
-def _design(path: Path, head: Head) -> tuple[int, int, dict[str, Array], Whole, Whole]:
+def _design(head: Results) -> dict[str, Any]:
     """What a header says of the members, see `SweepData`."""
-    if head.whole.get("kind") != "sweep":
-        raise UserError(f"{path.parent} is not the folder of a sweep: it holds a run")
-    with reading(path):
-        members = list(head.whole["members"])
-        axes = {
-            name: np.array([member["values"][name] for member in members], np.float64)
-            for name in members[0]["values"]
-        }
-        configurations, seeds = (
-            np.array([member[name] for member in members], np.int64)
-            for name in ("configuration", "seed")
-        )
+    with reading(head.folder / HEADER):
+        members = list(head.header["members"])
         if [member["member"] for member in members] != list(range(len(members))):
             raise ValueError("members are not in order")
-        drawn, halving = int(head.whole["random"]), int(head.whole["halving"])
-    return drawn, halving, axes, configurations, seeds
+        return {
+            "random": int(head.header["random"]),
+            "halving": int(head.header["halving"]),
+            "axes": {
+                name: np.array([member["values"][name] for member in members], float)
+                for name in members[0]["values"]
+            },
+            "configurations": np.array([m["configuration"] for m in members], np.int64),
+            "seeds": np.array([member["seed"] for member in members], np.int64),
+        }
 
 
 def batches_of(folder: Path, stage: int) -> Path:

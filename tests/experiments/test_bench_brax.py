@@ -10,6 +10,7 @@ import rewire_jax
 from experiments.bench_brax import Bench, run
 from rewire_jax.core.errors import UserError
 from rewire_jax.run.progress import Progress
+from tests.tiny import shrink_presets
 
 
 class Killed(BaseException):
@@ -18,23 +19,7 @@ class Killed(BaseException):
 
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    preset = rewire_jax.preset
-
-    def tiny(*arguments):
-        quick = preset(*arguments)
-        return dataclasses.replace(
-            quick,
-            tasks=2,
-            interactions=320,
-            envs=16,
-            updates=1,
-            warmup=160,
-            eval_episodes=2,
-            report_every=160,
-            sac=dataclasses.replace(quick.sac, hidden=8, depth=1, batch_size=8),
-        )
-
-    monkeypatch.setattr(rewire_jax, "preset", tiny)
+    shrink_presets(monkeypatch, hidden=8, tasks=2, interactions=320, updates=1)
     return Bench(scenario="probe/reach", methods=("ft1",), seeds=2, out=tmp_path)
 
 

@@ -1,4 +1,3 @@
-import csv
 import dataclasses
 import itertools
 import json
@@ -31,7 +30,7 @@ from rewire_jax.core.settings import to_json
 from rewire_jax.envs.scenarios import SCENARIOS
 from rewire_jax.methods import METHODS
 from rewire_jax.reports import paper_results
-from tests.fake_run import EDGE, GAP, SCORES, write_cw, write_run
+from tests.fake_run import EDGE, GAP, SCORES, rows, write_cw, write_run
 
 NAMES = ("halfcheetah/forgetting", "halfcheetah/transfer")
 
@@ -102,11 +101,6 @@ def performance(factor):
     end = SCORES[-1].mean()
     seeds = np.array([factor * end, factor * end + GAP]) / (end + GAP / 2)
     return seeds.mean(), seeds.std(ddof=1)
-
-
-def rows(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def test_table1_averages_over_finished_runs(trained, tmp_path, capsys):

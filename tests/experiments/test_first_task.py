@@ -1,21 +1,19 @@
 """Figures 3 and 5: curves of the first task, read from runs and summed up."""
 
-import csv
-import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import rewire_jax
 from experiments import figure3_mode_kl, first_task, suite
 from experiments.figure3_mode_kl import pattern, tell
 from experiments.figure5_evolution import beats, reached
 from experiments.first_task import FirstTask
 from rewire_jax.core.errors import UserError
 from rewire_jax.reports.training_curve_plot import Curve
-from tests.fake_run import write_run
+from tests.fake_run import rows, write_run
+from tests.tiny import shrink_presets
 
 POINTS = 20
 ENVS = 0.2  # so that they play an episode of ten steps in two reports
@@ -28,30 +26,9 @@ def reports(folder):
     return [json.loads(line) for line in lines]
 
 
-def rows(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def test_figure3_of_a_real_run(tmp_path, monkeypatch):
-    preset = rewire_jax.preset
-
-    def tiny(*arguments):
-        quick = preset(*arguments)
-        return dataclasses.replace(
-            quick,
-            interactions=640,
-            envs=16,
-            updates=8,
-            warmup=160,
-            eval_episodes=2,
-            selection_episodes=0,
-            report_every=160,
-            checkpoint_every=0,
-            sac=dataclasses.replace(quick.sac, hidden=32, depth=1, batch_size=16),
-        )
-
-    monkeypatch.setattr(rewire_jax, "preset", tiny)
+    few = {"updates": 8, "selection_episodes": 0, "checkpoint_every": 0}
+    shrink_presets(monkeypatch, hidden=32, interactions=640, **few)
     job = FirstTask(scenario="probe/reach", seeds=2, out=tmp_path)
     figure3_mode_kl.run(job)
     runs = tmp_path / "probe-reach-first-task-quick-tasks-1"

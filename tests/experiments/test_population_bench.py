@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments import population
+from experiments import population, suite
 from experiments.population import Population
 from rewire_jax.core.errors import UserError
 
@@ -65,7 +65,7 @@ def test_costs_are_in_units_of_the_smallest():
 
 
 def test_table_adds_arguments_and_temporary_arrays():
-    head, line = population.table([row(8, 0.5e-3, 0.25e-3)])
+    head, line = suite.table([row(8, 0.5e-3, 0.25e-3)], population.COLUMNS)
     assert dict(zip(head, line, strict=True)) == {
         "members": "8",
         "compile, s": "20",

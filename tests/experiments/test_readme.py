@@ -59,7 +59,7 @@ def test_some_columns_of_the_first_table_are_taken_by_how_they_begin(
     filled = fill(text, Path("page.md"), results)
     assert filled == (
         "<!-- results: one | e | bc -->\n\n# Title\n\n"
-        "| e | bc d |\n| --- | --- |\n| 3 | 2 |\n\n<!-- end -->\n"
+        "| e | bc d |\n| ---: | ---: |\n| 3 | 2 |\n\n<!-- end -->\n"
     )
     with pytest.raises(UserError, match=r"one has no column .* 'f'"):
         fill(text.replace("bc", "f"), Path("page.md"), results)

@@ -1,6 +1,5 @@
 """Reports on synthetic run folders with known numbers."""
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from fake_run import (
     RATES,
     SCORES,
     TRIPLET,
+    rows,
     write_alone,
     write_cw,
     write_run,
@@ -21,21 +21,18 @@ from fake_run import (
 from matplotlib.image import imread
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.reports.run_report import Report, to_terminal, write_report
+from rewire_jax.reports.report import Report, to_terminal
+from rewire_jax.reports.run_summary import Comparison
+from rewire_jax.reports.write import write_report
 from rewire_jax.storage.run_results import read_run
 
 METHODS = ("rewire", "ft1", "sac_n")
 RAW = "Scores are raw returns, not normalised: there is no SAC-N run among them"
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def cells(report: Report, label: str) -> dict[str, str]:
+def cells(report: Report[Comparison], label: str) -> dict[str, str]:
     """A run's row of the first table of the Markdown, by heading."""
-    table = report.markdown.read_text().split("\n\n| ")[1].splitlines()
+    table = report.page.read_text().split("\n\n| ")[1].splitlines()
     split = [line.strip("| ").split(" | ") for line in table]
     (found,) = [row for row in split if row[0] == label]
     return dict(zip(split[0], found, strict=True))
@@ -46,7 +43,7 @@ def test_known_numbers_everywhere(tmp_path: Path) -> None:
     report = write_report([run], tmp_path / "new" / "out")
 
     # Means over the seeds are 100 above seed 0; two values 200 apart: std 141.42.
-    text = report.markdown.read_text()
+    text = report.page.read_text()
     assert (
         "| Ours (rewire) | 1 hugefoot | 101 ± 141 | 1,100 ± 141 | 500 ± 141 | -600 ± 0 "
     ) in text
@@ -69,12 +66,12 @@ def test_known_numbers_everywhere(tmp_path: Path) -> None:
     assert "abc123" in text
     assert all(path.name in text for path in report.paths if path.suffix == ".png")
 
-    tasks = rows(report.tasks)
+    tasks = rows(report.folder / "tasks.csv")
     assert [row["name"] for row in tasks] == ["hugefoot", "moon", "carry_stuff"]
     assert float(tasks[1]["after_mean"]) == 2100
     assert float(tasks[1]["after_std"]) == pytest.approx(200 / 2**0.5)
     assert float(tasks[1]["forgetting_mean"]) == -500
-    (row,) = rows(report.csv)
+    (row,) = rows(report.folder / "report.csv")
     assert row["unit"] == "raw return"
     assert float(row["performance_mean"]) == pytest.approx(end)
     assert row["forward_transfer_mean"] == ""
@@ -82,7 +79,7 @@ def test_known_numbers_everywhere(tmp_path: Path) -> None:
     # Chunks of 250 and 500 interactions in 1 s and 2 s; the first ones compiled.
     assert float(row["interactions_per_second"]) == 2 * 750 / 3
 
-    (data,) = json.loads(report.json.read_text())["runs"]
+    (data,) = json.loads((report.folder / "result.json").read_text())["runs"]
     assert data["tasks"][0]["end"]["values"] == [400, 600]
     assert data["scores"][1][2] == [600, 1700, 3200]
     assert data["mean_forgetting"]["mean"] == pytest.approx(-1100 / 3)
@@ -102,7 +99,7 @@ def test_sac_n_normalises(tmp_path: Path) -> None:
     ]
     report = write_report(runs, tmp_path / "out")
     assert report.notes == ()
-    ours, theirs = report.summaries
+    ours, theirs = report.numbers.summaries
     assert theirs.performance.mean == pytest.approx(1)
     assert theirs.performance.std == pytest.approx(200 / 2**0.5 / 2000)
     assert theirs.transfer.mean == pytest.approx(0)
@@ -122,7 +119,7 @@ def test_sac_n_normalises(tmp_path: Path) -> None:
     row = cells(report, "SAC-N")
     assert row["model size"] == "8.00"
     assert row["paper's Table 3, this scenario (÷ SAC-N)"] == "–"
-    assert rows(report.csv)[0]["paper_table_3_mean"] == "1.31"
+    assert rows(report.folder / "report.csv")[0]["paper_table_3_mean"] == "1.31"
 
 
 def test_partial_runs_are_normalised_by_sac_n_at_their_stage(tmp_path: Path) -> None:
@@ -131,7 +128,7 @@ def test_partial_runs_are_normalised_by_sac_n_at_their_stage(tmp_path: Path) -> 
         write_run(tmp_path / "rewire", stages=2),
         write_run(tmp_path / "sac_n", method="sac_n", scores=scores),
     ]
-    ours, theirs = write_report(runs, tmp_path / "out").summaries
+    ours, theirs = write_report(runs, tmp_path / "out").numbers.summaries
     # After two tasks both have 700 and 2000; only SAC-N goes on.
     assert ours.performance.mean == pytest.approx(1)
     assert theirs.performance.mean == pytest.approx(1)
@@ -154,7 +151,7 @@ def test_sac_n_that_cannot_normalise(
     ]
     report = write_report(runs, tmp_path / "out")
     assert report.notes[0] == f"Scores are raw returns, not normalised: {why}."
-    assert report.summaries[0].performance.mean == pytest.approx(4900 / 3 + 100)
+    assert report.numbers.summaries[0].performance.mean == pytest.approx(4900 / 3 + 100)
     assert "performance (raw return)" in cells(report, "SAC-N")
 
 
@@ -164,7 +161,7 @@ def test_single_task(tmp_path: Path) -> None:
         write_run(tmp_path / name, method=name, **options)
         for name in ("rewire", "sac_n")
     ]
-    ours, theirs = write_report(runs, tmp_path / "out").summaries
+    ours, theirs = write_report(runs, tmp_path / "out").numbers.summaries
     assert ours.forgetting.mean == 0
     assert ours.transfer.mean == pytest.approx(0)
     assert ours.performance == theirs.performance
@@ -201,13 +198,17 @@ def test_terminal_fits_its_width(tmp_path: Path) -> None:
     assert "3,100 ± 141" in text
     assert "…" not in text
     assert "\x1b" not in text
-    assert str(report.curves) in text
+    assert str(report.folder / "curves.png") in text
 
 
 def test_pictures_are_not_blank(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name, method=name) for name in ("rewire", "ft1")]
     report = write_report(runs, tmp_path / "out")
-    for path in (report.curves, report.matrix, report.tradeoff):
+    for path in (
+        report.folder / "curves.png",
+        report.folder / "matrix.png",
+        report.folder / "tradeoff.png",
+    ):
         image = imread(path)
         assert min(image.shape[:2]) > 400
         assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 100
@@ -218,7 +219,7 @@ def test_pictures_are_not_blank(tmp_path: Path) -> None:
 def test_missing_file_is_named(tmp_path: Path, name: str) -> None:
     run = write_run(tmp_path / "run")
     (run / name).unlink()
-    with pytest.raises(UserError, match=f"{name} is missing") as error:
+    with pytest.raises(UserError, match=name) as error:
         write_report([run], tmp_path / "out")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
@@ -228,8 +229,8 @@ def test_diverged_seed_is_left_out(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", seeds=3, diverged=(1,))
     report = write_report([run], tmp_path / "out")
     note = report.notes[-1]
-    assert note.startswith("Ours (rewire): seed 1 diverged")
-    (data,) = json.loads(report.json.read_text())["runs"]
+    assert note.startswith("Ours (rewire): 1 diverged seed left out")
+    (data,) = json.loads((report.folder / "result.json").read_text())["runs"]
     assert data["kept"] == [0, 2]
     assert data["tasks"][0]["end"]["values"] == [400, 800]
     assert cells(report, "Ours (rewire)")["seeds"] == "2 of 3"
@@ -238,10 +239,8 @@ def test_diverged_seed_is_left_out(tmp_path: Path) -> None:
 def test_all_seeds_diverged(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", diverged=(0, 1))
     report = write_report([run], tmp_path / "out")
-    assert (
-        "| Ours (rewire) | 1 hugefoot | – | – | – | – |" in report.markdown.read_text()
-    )
-    assert "seeds 0, 1 diverged" in to_terminal(report).replace("\n", " ")
+    assert "| Ours (rewire) | 1 hugefoot | – | – | – | – |" in report.page.read_text()
+    assert "pictures: 0, 1." in to_terminal(report).replace("\n", " ")
 
 
 def test_partial_run_says_so(tmp_path: Path) -> None:
@@ -249,11 +248,11 @@ def test_partial_run_says_so(tmp_path: Path) -> None:
     report = write_report([run], tmp_path / "out")
     note = report.notes[-1]
     assert note.startswith("Ours (rewire): unfinished, 2 of 3 tasks")
-    text = report.markdown.read_text()
+    text = report.page.read_text()
     assert "| 1 hugefoot | 101 ± 141 | 1,100 ± 141 | 800 ± 141 | -300 ± 0 |" in text
     assert "| 3 carry_stuff | 103 ± 141 | – | – | – |" in text
     # Over the two trained tasks: (700 + 2000) / 2 + 100.
-    assert report.summaries[0].performance.mean == 1450
+    assert report.numbers.summaries[0].performance.mean == 1450
 
 
 def test_run_before_training(tmp_path: Path) -> None:
@@ -262,7 +261,7 @@ def test_run_before_training(tmp_path: Path) -> None:
     (run / "timing.jsonl").unlink()
     report = write_report([run], tmp_path / "out")
     assert "no results after training yet" in report.notes[-1]
-    assert "| 1 hugefoot | 101 ± 141 | – | – | – |" in report.markdown.read_text()
+    assert "| 1 hugefoot | 101 ± 141 | – | – | – |" in report.page.read_text()
     (run / "results.jsonl").write_text("")
     with pytest.raises(UserError, match="holds no results yet"):
         read_run(run)
@@ -271,12 +270,12 @@ def test_run_before_training(tmp_path: Path) -> None:
 def test_runs_of_one_method_are_told_apart(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / name) for name in ("a", "b")]
     report = write_report(runs, tmp_path / "out")
-    assert [s.label for s in report.summaries] == [
+    assert [s.label for s in report.numbers.summaries] == [
         "Ours (rewire): a",
         "Ours (rewire): b",
     ]
     # The paper's figures are not those of any variant.
-    assert "1.17" not in report.markdown.read_text()
+    assert "1.17" not in report.page.read_text()
     with pytest.raises(UserError, match="given twice"):
         write_report([runs[0], runs[0]], tmp_path / "out")
 
@@ -303,7 +302,7 @@ def test_incomparable_runs_are_refused(tmp_path: Path, other: dict[str, Any]) ->
 
 def test_one_seed_shows_no_spread(tmp_path: Path) -> None:
     report = write_report([write_run(tmp_path / "run", seeds=1)], tmp_path / "out")
-    text = report.markdown.read_text()
+    text = report.page.read_text()
     assert "1 hugefoot | 1.00 | 1,000 | 400 | -600 |" in text
     assert "1 seed," in report.title
     # Of three values none is cut.
@@ -329,7 +328,7 @@ def test_success_rates_are_never_normalised(tmp_path: Path) -> None:
     )
     assert report.notes == ()
     # Of seed 0 (0.4 + 0.5 + 0.7) / 3, and seed 1 has 0.1 more.
-    ours, base = report.summaries
+    ours, base = report.numbers.summaries
     end = 1.6 / 3 + EDGE / 2
     assert ours.performance.mean == pytest.approx(end)
     assert base.performance.mean == pytest.approx(0.8 / 3 + EDGE / 2)
@@ -340,8 +339,8 @@ def test_success_rates_are_never_normalised(tmp_path: Path) -> None:
     paper = "paper's Table 2, CW3, average of 8 triplets, Meta-World v1 (success rate)"
     assert row[paper] == "0.67 ± 0.09"
     assert "forward transfer" not in row
-    assert "forward_transfer_mean" not in rows(report.csv)[0]
-    assert rows(report.csv)[0]["unit"] == "success rate"
+    assert "forward_transfer_mean" not in rows(report.folder / "report.csv")[0]
+    assert rows(report.folder / "report.csv")[0]["unit"] == "success rate"
     text = " ".join(to_terminal(report).split())
     assert "solved at any of their steps" in text
     assert "Meta-World v1: the tasks" in text
@@ -353,16 +352,16 @@ def test_both_rules_of_success_and_the_return_are_always_there(tmp_path: Path) -
     run = write_cw(tmp_path / "run")
     anywhere = write_report([run], tmp_path / "any")
     last = write_report([run], tmp_path / "last", success="last")
-    assert last.summaries[0].performance.mean == pytest.approx(
-        anywhere.summaries[0].performance.mean / 2
+    assert last.numbers.summaries[0].performance.mean == pytest.approx(
+        anywhere.numbers.summaries[0].performance.mean / 2
     )
     row = cells(last, "Ours (rewire)")
     assert row["performance (success rate at the last step)"] == "0.29 ± 0.04"
     names = {"success": 0.95, "success_last": 0.475, "return": 2100}
     for report, mine in ((anywhere, "success"), (last, "success_last")):
-        row = rows(report.tasks)[1]
+        row = rows(report.folder / "tasks.csv")[1]
         assert (row["name"], row["score"]) == (TRIPLET[1], mine)
-        (data,) = json.loads(report.json.read_text())["runs"]
+        (data,) = json.loads((report.folder / "result.json").read_text())["runs"]
         for name, after in names.items():
             prefix = "" if name == mine else f"{name}_"
             assert float(row[f"{prefix}after_mean"]) == pytest.approx(after)
@@ -394,24 +393,24 @@ def test_forward_transfer_from_single_task_runs(tmp_path: Path) -> None:
             alone = (area(other, 0) + area(other, 1)) / 2
             each.append((area(mine, seed) - alone) / (1 - alone))
         expected.append(each)
-    (ours,) = report.summaries
+    (ours,) = report.numbers.summaries
     assert ours.transfer.values == pytest.approx(np.mean(expected, axis=1))
     for task, values in zip(ours.tasks, np.transpose(expected), strict=True):
         assert task["transfer"].values == pytest.approx(values)
     shown = cells(report, "Ours (rewire)")["forward transfer"]
     assert shown.startswith(f"{np.mean(expected):.2f} ± ")
-    text = report.markdown.read_text()
+    text = report.page.read_text()
     assert f"- {TRIPLET[2]} alone: `{single[2]}`" in text
     assert "(AUC - AUC_b) / (1 - AUC_b)" in text
-    data = json.loads(report.json.read_text())
+    data = json.loads((report.folder / "result.json").read_text())
     assert [one["task"] for one in data["single"]] == list(TRIPLET)
-    assert float(rows(report.tasks)[1]["transfer_mean"]) == pytest.approx(
-        np.mean(expected, axis=0)[1]
-    )
+    assert float(
+        rows(report.folder / "tasks.csv")[1]["transfer_mean"]
+    ) == pytest.approx(np.mean(expected, axis=0)[1])
     # By the other rule all rates are halved, so that there is more room above.
     (halved,) = write_report(
         [run], tmp_path / "out", single=single, success="last"
-    ).summaries
+    ).numbers.summaries
     alone = (area(np.array(curves[1]), 0) + EDGE / 2) / 2
     assert halved.tasks[1]["transfer"].values[0] == pytest.approx(
         (area(LEARNING[1], 0) / 2 - alone) / (1 - alone)
@@ -428,7 +427,7 @@ def test_forward_transfer_of_what_was_trained(tmp_path: Path) -> None:
         write_alone(tmp_path / task, task, learning, seeds=1)
         for task, learning in zip(TRIPLET, (always, LEARNING[1], always), strict=True)
     ]
-    ours, other = write_report(runs, tmp_path / "out", single=single).summaries
+    ours, other = write_report(runs, tmp_path / "out", single=single).numbers.summaries
     # Nothing exceeds the first, the third is not trained yet.
     transfer = [task["transfer"].mean for task in ours.tasks]
     alone = (0.4 + 2 * 0.8) / 3

@@ -19,7 +19,7 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import TaskChange
 from rewire_jax.envs.scenarios import ScenarioSpec, make_scenario
-from rewire_jax.reports.run_report import write_report
+from rewire_jax.reports.write import write_report
 from rewire_jax.run import run_state, train_run
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from experiments import memory_needs
+from experiments import memory_needs, suite
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import make_scenario
@@ -237,6 +237,6 @@ def test_table_of_needs_has_what_is_counted():
     row = memory_needs.count(scenario, "ft1", envs=32)
     plan = prepare(replace(preset(scenario, "ft1"), envs=32, seeds=1), scenario)
     assert row["total"] == memory_estimate.need(plan).total
-    head, line = memory_needs.table([row])
+    head, line = suite.table([row], memory_needs.COLUMNS)
     assert line[:3] == ["probe/reach", "FT-1", "32"]
     assert dict(zip(head, line, strict=True))["total"] == f"{row['total'] / 1e6:.1f}"
