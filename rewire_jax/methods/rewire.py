@@ -250,6 +250,7 @@ def select_order(
     """
     if selection is None:
         return jnp.argsort(params.scores[0], axis=-1), jnp.asarray(False)
+    assert selection.before is not None  # The method sets `baseline`.
     valid = design.valid()
     # A return that is not a number must not win, as it would in argmax.
     valued = valid & ~jnp.isnan(selection.after)

@@ -164,7 +164,8 @@ def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
 def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:
     """Applies the `MLP` with these layers, `[..., inputs]` -> `[..., outputs]`."""
     network = MLP([layer.bias.shape[-1] for layer in layers])
-    return network.apply(as_variables(layers), x)
+    output: jax.Array = network.apply(as_variables(layers), x)  # type: ignore[assignment]
+    return output
 
 
 def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:
