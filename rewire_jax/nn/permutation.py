@@ -146,7 +146,7 @@ def _score_gradient(gradients, permuted, order, scores, tau, axis=0):
     in_sorted = score_gradient(
         [g.astype(wide) for g in gradients],
         [x.astype(wide) for x in permuted],
-        scores[order].astype(wide),
+        jnp.asarray(scores)[order].astype(wide),
         jnp.asarray(tau, wide),
         _block(scores.shape[0]),
         axis,

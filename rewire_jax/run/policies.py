@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -41,7 +42,8 @@ class Policies(NamedTuple):
     Attributes:
       act: `(member, task, observation) -> action` for a member's `Learned`, a `[]` int
         and `[..., observations]`; action `[..., actions]` in [-1, 1], without
-        exploration. It can be jitted, and vmapped over members, tasks or both.
+        exploration. It can be jitted, and vmapped over members, tasks or both. It
+        raises `AssertionError` for observations of another length.
       members: what all have learned, `[seeds]` on the leading axis of every leaf.
       seeds: of the members, in their order.
       tasks: names of the sequence.
@@ -73,7 +75,8 @@ def load_policy(
 
     Returns:
       Observation `[..., observations]` (as the scenario's environment gives it) to
-      action `[..., actions]`, without exploration. It can be jitted and vmapped.
+      action `[..., actions]`, without exploration. It can be jitted and vmapped. It
+      raises `AssertionError` for observations of another length.
 
     Raises:
       UserError: no such run, task, seed, member or stage, or a damaged checkpoint.
@@ -104,7 +107,7 @@ def load_policy(
     method = find_method(settings.method).make(spec, settings.options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
     policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
-    return functools.partial(_act, method, policy)
+    return functools.partial(_act, method, spec, policy)
 
 
 def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
@@ -128,7 +131,7 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
 
     def act(member: Learned, task: jax.Array | int, observation: jax.Array):
         policy = method.policy(member.params, member.method_state, jnp.asarray(task))
-        return _act(method, policy, observation)
+        return _act(method, spec, policy, observation)
 
     seeds = range(settings.seed, settings.seed + settings.seeds)
     members = _load(Found(folder, stage, 0, settings.seeds), method)
@@ -141,7 +144,8 @@ def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
     return header, settings, Spec(**header["spec"])
 
 
-def _act(method: Method, policy: Any, observation: jax.Array) -> jax.Array:
+def _act(method: Method, spec: Spec, policy: Any, observation: jax.Array) -> jax.Array:
+    chex.assert_axis_dimension(observation, -1, spec.observations)
     mean, _ = method.act(policy, observation)
     return jnp.tanh(mean)
 
