@@ -19,7 +19,7 @@ import numpy as np
 import optax
 
 from experiments import suite
-from rewire_jax.methods import wiring
+from rewire_jax.methods import rewire_losses, wiring
 from rewire_jax.nn import networks
 
 # Form of the loss, factor on the adapters' learning rate.
@@ -72,13 +72,13 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
     previous = networks.init_mlp(key, [job.observations, *[width] * depth])
     adapters = wiring.identity_adapters(depth, width)
     adam = optax.scale_by_adam()
-    square = wiring.squared_distance(
+    square = rewire_losses.weight_loss(
         previous, jax.tree.map(jnp.zeros_like, list(previous))
     )
 
     def loss(params, expanded=form == "expanded"):
         hidden, adapters = params
-        distance = wiring.alignment_loss(
+        distance = rewire_losses.alignment_loss(
             hidden, previous, adapters, job.tau, expanded=expanded
         )
         return job.beta * distance

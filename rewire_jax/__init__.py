@@ -17,7 +17,7 @@ from rewire_jax.envs.scenarios import (
     register_scenario,
 )
 from rewire_jax.methods import register_method
-from rewire_jax.nn.permutation import permute
+from rewire_jax.nn import MLP, Permute, RewiredDense, permute
 from rewire_jax.rendering.render import render
 from rewire_jax.reports.write import write_report
 from rewire_jax.run.evaluation import evaluate, info
@@ -30,6 +30,9 @@ from rewire_jax.training.presets import preset
 from rewire_jax.version import __version__
 
 __all__ = [
+    "MLP",
+    "Permute",
+    "RewiredDense",
     "SacSettings",
     "Scenario",
     "ScenarioSpec",

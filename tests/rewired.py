@@ -5,9 +5,9 @@ import functools
 import jax
 import numpy as np
 
-from rewire_jax.methods import rewire as rewiring
 from rewire_jax.methods.base import Selection, Spec
-from rewire_jax.methods.rewire import RewireSettings
+from rewire_jax.methods.rewire import rewire
+from rewire_jax.methods.rewire_settings import RewireSettings
 from rewire_jax.nn.networks import Linear
 
 OBSERVATIONS, ACTIONS, N, DEPTH, TASKS, SLOTS, K = 5, 2, 12, 2, 6, 3, 3
@@ -21,13 +21,13 @@ OBSERVATION = OBSERVATION.astype(np.float32)
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def call(name, spec, options, *arguments):
-    return getattr(rewiring.rewire(spec, options), name)(*arguments)
+    return getattr(rewire(spec, options), name)(*arguments)
 
 
 def make(spec=SPEC, **values):
     """The method; as in a run, its numbers are traced, so that few are compiled."""
     options = RewireSettings(**{"modes": K, "head_slots": SLOTS} | values).checked()
-    method = rewiring.rewire(spec, options)
+    method = rewire(spec, options)
     static = ("context", "act", "size", "adjust_updates")
     traced = {
         name: functools.partial(call, name, spec, options)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import chex
 import jax
 
 from rewire_jax.envs.geom_trajectory import Film
@@ -67,6 +68,21 @@ class Environment(NamedTuple):
     success: bool = False
     varied: bool = False
     film: Callable[[Task, Sequence[Any]], Film] | None = None
+
+
+def check_state(environment: Environment, state: State) -> State:
+    """What `reset` or `step` gave, checked while it is traced.
+
+    Raises:
+      AssertionError: a shape or type is not the one that `State` names.
+    """
+    chex.assert_shape(state.observation, (environment.observation_size,))
+    chex.assert_shape([state.reward, state.terminal], ())
+    chex.assert_type([state.observation, state.reward], float)
+    chex.assert_type(state.terminal, bool)
+    if environment.success:
+        chex.assert_shape(state.success, ())
+    return state
 
 
 class HostEnvironment(NamedTuple):

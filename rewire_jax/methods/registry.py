@@ -4,9 +4,17 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.methods import csp, finetune, packnet, pnn, regularization
-from rewire_jax.methods import rewire as rewiring
+from rewire_jax.methods import (
+    csp_settings,
+    finetune,
+    packnet,
+    pnn,
+    regularization,
+    rewire_settings,
+)
 from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.csp import csp
+from rewire_jax.methods.rewire import rewire
 
 
 class Entry(NamedTuple):
@@ -44,12 +52,12 @@ METHODS: dict[str, Entry] = {
     "pnn": Entry(pnn.pnn, pnn.PnnSettings, pnn.preset),
     "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
     "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
-    "csp": Entry(csp.csp, csp.CspSettings, csp.preset, 1),
+    "csp": Entry(csp, csp_settings.CspSettings, csp_settings.preset, 1),
     "rewire": Entry(
-        rewiring.rewire,
-        rewiring.RewireSettings,
-        rewiring.preset,
-        together=rewiring.together,
+        rewire,
+        rewire_settings.RewireSettings,
+        rewire_settings.preset,
+        together=rewire_settings.together,
     ),
 }
 

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from rewire_jax.nn.networks import Linear, affine
-from rewire_jax.nn.permutation import permute, permute_rows
+from rewire_jax.nn.networks import Linear
+from rewire_jax.nn.permutation import permute
+from rewire_jax.nn.wired_layers import even_scores, permute_outputs
 
 Hidden = Sequence[Linear]
 
@@ -42,29 +43,8 @@ def spread(orders: jax.Array) -> jax.Array:
 
 def identity_adapters(depth: int, n: int) -> Adapters:
     """Adapters that move nothing."""
-    scores = spread(jnp.arange(n))
+    scores = even_scores(n)
     return Adapters(jnp.tile(scores, (depth, 1)), jnp.tile(scores, (depth - 1, 1)))
-
-
-def permute_outputs(layer: Linear, scores: jax.Array, tau: ArrayLike) -> Linear:
-    """The layer whose output is `permute(layer's output, scores, tau)`.
-
-    Both gradients are those of permuting the output, summed over the batch, at
-    the cost of a permutation of the weights.
-    """
-    return Linear(*permute_rows(list(layer), scores, tau))
-
-
-def wired(layer: Linear, scores: jax.Array, tau: ArrayLike, x: jax.Array) -> jax.Array:
-    """A layer's output `[..., n]` for x `[..., inputs]`, in the order of scores `[n]`.
-
-    Eq. 2, before the activation. A large batch is spared by permuting the weights, a
-    small one is permuted itself: value and gradients are the same.
-    """
-    batch, inputs = x.size // x.shape[-1], x.shape[-1]
-    if batch < inputs:
-        return permute(affine(layer, x), scores, tau)
-    return affine(permute_outputs(layer, scores, tau), x)
 
 
 def fold(hidden: Hidden, orders: jax.Array) -> list[Linear]:
@@ -81,39 +61,6 @@ def adapt(previous: Hidden, adapters: Adapters, tau: ArrayLike) -> list[Linear]:
             weight = permute(weight, adapters.inp[index - 1], tau)
         adapted.append(Linear(weight, bias))
     return adapted
-
-
-def alignment_loss(
-    hidden: Hidden,
-    previous: Hidden,
-    adapters: Adapters,
-    tau: ArrayLike,
-    *,
-    expanded: bool = False,
-) -> jax.Array:
-    """L_SP, the squared distance to the adapted previous weights and biases (Eq. 11).
-
-    Args:
-      hidden: current layers.
-      previous: layers at the end of the previous task.
-      adapters: their permutation.
-      tau: temperature of the adapters' relaxation.
-      expanded: leave out the square of the adapted weights, constant under true
-        permutations but not under their relaxation (the authors' code).
-    """
-    adapted = adapt(previous, adapters, tau)
-    if not expanded:
-        return squared_distance(hidden, adapted)
-    leaves = zip(jax.tree.leaves(hidden), jax.tree.leaves(adapted), strict=True)
-    return sum(
-        (jnp.sum(now**2 - 2 * now * then) for now, then in leaves), jnp.zeros(())
-    )
-
-
-def squared_distance(hidden: Hidden, others: Hidden) -> jax.Array:
-    """Sum of squared differences of all weights and biases."""
-    leaves = zip(jax.tree.leaves(hidden), jax.tree.leaves(others), strict=True)
-    return sum((jnp.sum((now - then) ** 2) for now, then in leaves), jnp.zeros(()))
 
 
 def refine(orders: jax.Array, adapters: Adapters) -> jax.Array:

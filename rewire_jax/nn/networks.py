@@ -1,8 +1,15 @@
-"""Multi-layer perceptrons and the tanh-squashed Gaussian."""
+"""Multi-layer perceptrons and the tanh-squashed Gaussian.
 
-from collections.abc import Sequence
-from typing import NamedTuple
+Parameters are stored as a tuple of `Linear`, a layer each: methods reorder, mix and
+prune them layer by layer. `MLP` is the Flax module of the same network;
+`as_variables` and `as_layers` rename one form into the other without a copy.
+"""
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import chex
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
@@ -30,12 +37,6 @@ def init_linear(key: jax.Array, inputs: int, outputs: int) -> Linear:
         jax.random.uniform(weight_key, (outputs, inputs), minval=-bound, maxval=bound),
         jax.random.uniform(bias_key, (outputs,), minval=-bound, maxval=bound),
     )
-
-
-def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
-    """Layers `sizes[0] -> sizes[1] -> ...`, one key each."""
-    keys = jax.random.split(key, len(sizes) - 1)
-    return tuple(map(init_linear, keys, sizes[:-1], sizes[1:]))
 
 
 def activate(x: jax.Array) -> jax.Array:
@@ -69,11 +70,102 @@ def _product_jvp(primals, tangents):
     return value, _dot(by_x, weight) + turned.T.reshape(value.shape)
 
 
+class Dense(nn.Module):
+    """The affine layer W x + b as a module, uniform in ±1/sqrt(inputs) at first.
+
+    Its parameters are those of `Linear`.
+
+    Attributes:
+      features: length of the output.
+      key: what the first parameters are drawn with; Flax's own key if None.
+    """
+
+    features: int
+    key: jax.Array | None = None
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[..., inputs]` -> `[..., features]`.
+
+        Raises:
+          AssertionError: x is not of floats.
+          flax.errors.ScopeParamShapeError: the parameters are for other sizes.
+        """
+        chex.assert_type(x, float)
+        return affine(linear_params(self, x.shape[-1], self.features, self.key), x)
+
+
+def linear_params(
+    module: nn.Module, inputs: int, outputs: int, key: jax.Array | None = None
+) -> Linear:
+    """A module's parameters `weight` and `bias`, see `Dense`."""
+
+    def initial(own, name):
+        layer = init_linear(own if key is None else key, inputs, outputs)
+        return getattr(layer, name)
+
+    return Linear(*(module.param(name, initial, name) for name in Linear._fields))
+
+
+class MLP(nn.Module):
+    """Dense layers with an activation between each two: every policy and critic.
+
+    The same key gives the same first parameters as `init_mlp`.
+
+    Attributes:
+      features: length of each layer's output: `[hidden] * depth + [outputs]`.
+      activation: between the layers.
+    """
+
+    features: Sequence[int]
+    activation: Callable[[jax.Array], jax.Array] = activate
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """`[..., inputs]` -> `[..., features[-1]]`; errors as of `Dense`."""
+        for index, (size, key) in enumerate(
+            zip(self.features, self._keys(), strict=True)
+        ):
+            x = self.activation(x) if index else x
+            x = Dense(size, key, name=_name(index))(x)
+        return x
+
+    def _keys(self) -> Sequence[jax.Array | None]:
+        """Of the layers' first parameters; None where parameters are given."""
+        if self.scope is None or not self.is_initializing():
+            return [None] * len(self.features)
+        # `make_rng` would fold a count into it: other numbers than those of all runs.
+        key = self.scope.rngs["params"].as_jax_rng()
+        return list(jax.random.split(key, len(self.features)))
+
+
+def _name(index: int) -> str:
+    return f"layers_{index}"
+
+
+def as_variables(layers: Sequence[Linear]) -> dict[str, Any]:
+    """What `MLP.apply` takes, from the stored form."""
+    return {
+        "params": {_name(i): layer._asdict() for i, layer in enumerate(layers)},
+    }
+
+
+def as_layers(variables: Mapping[str, Any]) -> tuple[Linear, ...]:
+    """The stored form of what `MLP.init` gives."""
+    params = variables["params"]
+    return tuple(Linear(**params[_name(i)]) for i in range(len(params)))
+
+
+def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
+    """Layers `sizes[0] -> sizes[1] -> ...` of an `MLP`, one key each."""
+    return as_layers(MLP(sizes[1:]).init(key, jnp.zeros(sizes[0])))
+
+
 def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:
-    """Applies the layers with an activation between each two."""
-    for layer in layers[:-1]:
-        x = activate(affine(layer, x))
-    return affine(layers[-1], x)
+    """Applies the `MLP` with these layers, `[..., inputs]` -> `[..., outputs]`."""
+    network = MLP([layer.bias.shape[-1] for layer in layers])
+    output: jax.Array = network.apply(as_variables(layers), x)  # type: ignore[assignment]
+    return output
 
 
 def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:

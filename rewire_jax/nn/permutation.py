@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,6 @@ devices a choice, not measured: one large product rather than many small kernels
 """
 
 
-@jax.custom_vjp
 def permute(x: jax.Array, scores: jax.Array, tau: jax.typing.ArrayLike) -> jax.Array:
     """Reorders the last axis of `x` by ascending `scores`, learnably (Eq. 3, 4).
 
@@ -34,7 +34,18 @@ def permute(x: jax.Array, scores: jax.Array, tau: jax.typing.ArrayLike) -> jax.A
 
     Returns:
       `[..., n]`, in the dtype of `x`.
+
+    Raises:
+      AssertionError: the shapes do not fit, or an array is not of floats.
     """
+    chex.assert_rank([scores, tau], [1, 0])
+    chex.assert_axis_dimension(x, -1, scores.shape[0])
+    chex.assert_type([x, scores], float)
+    return _permute(x, scores, tau)
+
+
+@jax.custom_vjp
+def _permute(x, scores, tau):
     return _take_last(x, _order(scores))
 
 
@@ -54,7 +65,7 @@ def _backward(residuals, gradient):
     )
 
 
-permute.defvjp(_forward, _backward)
+_permute.defvjp(_forward, _backward)
 
 
 @jax.custom_vjp
@@ -135,7 +146,7 @@ def _score_gradient(gradients, permuted, order, scores, tau, axis=0):
     in_sorted = score_gradient(
         [g.astype(wide) for g in gradients],
         [x.astype(wide) for x in permuted],
-        scores[order].astype(wide),
+        jnp.asarray(scores)[order].astype(wide),
         jnp.asarray(tau, wide),
         _block(scores.shape[0]),
         axis,

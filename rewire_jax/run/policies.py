@@ -30,7 +30,7 @@ class Policies(NamedTuple):
       act: `(member, task, observation) -> action`. `member` is a `Learned`, `task` a
         `[]` int, `observation` `[..., observations]`. The action `[..., actions]` is in
         [-1, 1], without exploration. You can jit it, and vmap it over members, tasks
-        or both.
+        or both. It raises `AssertionError` for observations of another length.
       members: of all members, with a leading axis `[seeds]` on every leaf.
       seeds: of the members, in their order.
       tasks: names of the sequence.
@@ -62,7 +62,8 @@ def load_policy(
 
     Returns:
       A function from an observation `[..., observations]` of the scenario's environment
-      to an action `[..., actions]`, without exploration. You can jit and vmap it.
+      to an action `[..., actions]`, without exploration. You can jit and vmap it. It
+      raises `AssertionError` for observations of another length.
 
     Raises:
       UserError: no such run, task, seed, member or stage, or a damaged checkpoint.
@@ -93,7 +94,7 @@ def load_policy(
     method = find_method(settings.method).make(spec, settings.options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
     policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
-    return functools.partial(mean_action, method, policy)
+    return functools.partial(mean_action, method, spec, policy)
 
 
 def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
@@ -117,7 +118,8 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
 
     seeds = range(settings.seed, settings.seed + settings.seeds)
     members = _load(Found(folder, stage, 0, settings.seeds), method)
-    return Policies(act_function(method), members, tuple(seeds), tuple(header["tasks"]))
+    act = act_function(method, spec)
+    return Policies(act, members, tuple(seeds), tuple(header["tasks"]))
 
 
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:

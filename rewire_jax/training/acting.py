@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.methods.base import Method, Policy
+from rewire_jax.methods.base import Method, Policy, Spec
 
 
 class Learned(NamedTuple):
@@ -27,19 +28,26 @@ Act = Callable[[Learned, jax.Array | int, jax.Array], jax.Array]
 `[..., actions]` in [-1, 1]."""
 
 
-def mean_action(method: Method, policy: Policy, observation: jax.Array) -> jax.Array:
-    """`[..., actions]` in [-1, 1], that of a policy for `[..., observations]`."""
+def mean_action(
+    method: Method, spec: Spec, policy: Policy, observation: jax.Array
+) -> jax.Array:
+    """A policy's action `[..., actions]` in [-1, 1] for `[..., observations]`.
+
+    Raises:
+      AssertionError: an observation of another length than the method was made for.
+    """
+    chex.assert_axis_dimension(observation, -1, spec.observations)
     mean, _ = method.act(policy, observation)
     return jnp.tanh(mean)
 
 
-def act_function(method: Method) -> Act:
-    """How to act by what a method has learned."""
+def act_function(method: Method, spec: Spec) -> Act:
+    """How to act by what a method, made from this spec, has learned."""
 
     def act(
         learned: Learned, task: jax.Array | int, observation: jax.Array
     ) -> jax.Array:
         policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
-        return mean_action(method, policy, observation)
+        return mean_action(method, spec, policy, observation)
 
     return act

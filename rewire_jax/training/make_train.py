@@ -129,7 +129,8 @@ def make_act(settings: Settings, scenario: Scenario | None = None) -> Act:
     """
     settings, scenario = complete(settings, scenario)
     spec = make_functions(settings, scenario).spec
-    return act_function(find_method(settings.method).make(spec, settings.options))
+    method = find_method(settings.method).make(spec, settings.options)
+    return act_function(method, spec)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -97,7 +98,14 @@ def add(
         observation of the next one.
       episode_length: as in `create`.
       extras: as in `create`.
+
+    Raises:
+      AssertionError: the shapes are not those of the buffer.
     """
+    chex.assert_shape([final_obs, next_obs], replay.observation.shape[1:])
+    chex.assert_shape(action, replay.action.shape[1:])
+    chex.assert_shape([reward, terminal, truncated], replay.reward.shape[1:])
+    chex.assert_type([terminal, truncated], bool)
     rows, cuts = replay.reward.shape[0], replay.final.shape[0]
 
     def put(array, row, value):

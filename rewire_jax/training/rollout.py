@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.envs.base import Environment, HostEnvironment, State, Task
+from rewire_jax.envs.base import Environment, HostEnvironment, State, Task, check_state
 from rewire_jax.methods.base import axes
 
 
@@ -99,8 +99,8 @@ def succeed(before: Any, now: Any) -> Any:
 
 
 def begin(environment: Environment, task: Task, key: jax.Array) -> Episode:
-    """An environment at the start of an episode."""
-    state = environment.reset(task, key)
+    """An environment at the start of an episode; errors as of `check_state`."""
+    state = check_state(environment, environment.reset(task, key))
     none = no_success(environment)
     return Episode(state, state, jnp.zeros((), jnp.int32), jnp.zeros(()), none)
 
@@ -112,8 +112,12 @@ def advance(
 
     A stored start, as in brax's wrapper, avoids a reset in every step. Each environment
     has its own start in each task.
+
+    Raises:
+      AssertionError: see `check_state`.
     """
     state = environment.step(task, episode.state, action)
+    check_state(environment, state)
     steps = episode.steps + 1
     score = episode.score + state.reward
     success = succeed(episode.success, state.success)

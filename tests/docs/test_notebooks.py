@@ -54,12 +54,13 @@ def words(notebook: nbformat.NotebookNode) -> list[str]:
     return [re.sub(rf"{number}|\s+", "", text) for text in texts(notebook)]
 
 
-def test_there_are_four() -> None:
+def test_there_are_five() -> None:
     assert [path.stem for path in PATHS] == [
         "01_policies",
         "02_sweep",
         "03_your_own_method",
         "04_your_own_scenario",
+        "05_permutation_layers",
     ]
 
 
@@ -114,7 +115,7 @@ def test_it_runs_anywhere_and_gives_what_is_committed(
     assert words(again) == words(committed)
     assert len(pictures(again)) == len(pictures(committed))
     # All that it makes is under one folder that can be deleted.
-    assert [each.name for each in folder.iterdir()] == ["runs"]
+    assert {each.name for each in folder.iterdir()} <= {"runs"}
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from experiments.speed import loops, peer_rejax, peer_sbx, peer_torch  # noqa: E
 from experiments.speed.part import Effort  # noqa: E402
 from experiments.speed.updates import draw_batches, updates  # noqa: E402
 from rewire_jax.envs.scenarios import make_scenario  # noqa: E402
-from rewire_jax.methods import wiring  # noqa: E402
+from rewire_jax.methods import rewire_losses, wiring  # noqa: E402
 from rewire_jax.nn.networks import Linear  # noqa: E402
 from rewire_jax.nn.permutation import permute  # noqa: E402
 from rewire_jax.training.run_setup import prepare  # noqa: E402
@@ -105,7 +105,7 @@ def test_the_alignment_is_ours(world):
     adapters = wiring.Adapters(
         jnp.array(rewired.adapters.detach()), jnp.array(rewired.input_adapters.detach())
     )
-    expected = wiring.alignment_loss(
+    expected = rewire_losses.alignment_loss(
         ours(rewired.layers[:-1]),
         ours(rewired.previous),
         adapters,

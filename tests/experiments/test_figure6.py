@@ -10,7 +10,7 @@ import rewire_jax
 from experiments import figure6_sensitivity
 from experiments.figure6_sensitivity import Figure6
 from rewire_jax.envs.scenarios import SCENARIOS
-from rewire_jax.methods.rewire import RewireSettings
+from rewire_jax.methods.rewire_settings import RewireSettings
 from tests.fake_sweep import write_sweep
 
 NAME = "halfcheetah/forgetting"

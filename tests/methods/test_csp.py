@@ -11,9 +11,9 @@ import rewire_jax
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.transition import Batch
 from rewire_jax.envs.scenarios import make_scenario
-from rewire_jax.methods import csp
+from rewire_jax.methods import csp, csp_settings
 from rewire_jax.methods.base import Selection, Spec, Tools, count
-from rewire_jax.methods.csp import CspSettings
+from rewire_jax.methods.csp_settings import CspSettings
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 from rewire_jax.run import train_run
@@ -152,7 +152,7 @@ def test_presets_are_the_published_values():
     often = {"halfcheetah/transfer", "halfcheetah/robustness", "ant/compositionality"}
     names = [f"{d}/{s}" for d in ("halfcheetah", "ant") for s in BRAX_SERIES]
     for name in [*names, "humanoid/hard", "probe/reach", "continual_world/cw10"]:
-        paper = csp.preset(name, 4, "paper").checked()
+        paper = csp_settings.preset(name, 4, "paper").checked()
         assert paper == CspSettings(
             distribution="peaked" if name in peaked else "flat",
             resample_every=20 if name in often else 100,
@@ -162,7 +162,7 @@ def test_presets_are_the_published_values():
             # Continual World's episodes are a fifth as long.
             rollouts=32 if name == "continual_world/cw10" else 8,
         )
-        quick = csp.preset(name, 4, "quick").checked()
+        quick = csp_settings.preset(name, 4, "quick").checked()
         assert quick.distribution == paper.distribution
         assert quick.samples * quick.estimations < paper.samples * paper.estimations
 

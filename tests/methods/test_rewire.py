@@ -5,9 +5,10 @@ import pytest
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import find_method, finetune
-from rewire_jax.methods import rewire as rewiring
 from rewire_jax.methods.base import Spec
-from rewire_jax.methods.rewire import Context, RewireSettings
+from rewire_jax.methods.rewire import rewire
+from rewire_jax.methods.rewire_settings import RewireSettings
+from rewire_jax.methods.rewire_state import Context
 from tests.rewired import (
     ACTIONS,
     DEPTH,
@@ -176,7 +177,7 @@ def test_model_size(row):
 
     for places in (0, 5):  # spare places are not stored
         options = RewireSettings(head_slots=heads, mode_slots=places).checked()
-        method = rewiring.rewire(spec, options)
+        method = rewire(spec, options)
         params, state = jax.eval_shape(method.init, KEY)
         assert method.size(params, state) == stored
     if published:

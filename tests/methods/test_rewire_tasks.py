@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewire_jax.methods import rewire as rewiring
 from rewire_jax.methods import wiring
 from rewire_jax.methods.base import Selection
-from rewire_jax.methods.rewire import Context, RewireSettings
+from rewire_jax.methods.rewire import rewire
+from rewire_jax.methods.rewire_settings import RewireSettings
+from rewire_jax.methods.rewire_state import Context
 from rewire_jax.nn.networks import Linear
 from tests.rewired import (
     ACTIONS,
@@ -283,7 +284,7 @@ def live(params, state, shift, result, modes):
     options = RewireSettings(
         mode_slots=len(shift), head_slots=SLOTS, alpha=0.1, dropout=0.2
     )
-    method = rewiring.rewire(FLAT, dataclasses.replace(options, modes=modes))
+    method = rewire(FLAT, dataclasses.replace(options, modes=modes))
     params, state = method.start_task(KEY, params, state, 1)
     params = params._replace(
         scores=params.scores + shift,

@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewire_jax.methods import rewire as rewiring
-from rewire_jax.methods import wiring
-from rewire_jax.methods.rewire import Context, RewireSettings, gaussian_kl
+from rewire_jax.methods import rewire_losses
+from rewire_jax.methods.rewire import rewire
+from rewire_jax.methods.rewire_losses import gaussian_kl, squared_differences
+from rewire_jax.methods.rewire_settings import RewireSettings
+from rewire_jax.methods.rewire_state import Context
 from tests.rewired import (
     ACTIONS,
     DEPTH,
@@ -66,7 +68,7 @@ def test_only_the_mode_in_use_learns_in_all_layers(rate):
 
     def ours(scores, tau):
         options = RewireSettings(head_slots=SLOTS, mode_rate=rate, tau=tau)
-        method = rewiring.rewire(SPEC, dataclasses.replace(options, mode_slots=K))
+        method = rewire(SPEC, dataclasses.replace(options, mode_slots=K))
         context = Context(1, 0, QUIET, KEY)
         mean, log_std = method.distribution(
             params._replace(scores=scores), state, context, OBSERVATION
@@ -129,7 +131,7 @@ def test_updates_are_scaled_after_the_optimiser(rate, factor):
 
 @functools.partial(jax.jit, static_argnames=("number", "purpose"))
 def contexts(options, number, purpose):
-    method = rewiring.rewire(SPEC, options)
+    method = rewire(SPEC, options)
     _, state = method.init(KEY)
     draw = jax.vmap(lambda key: method.context(key, state, purpose, ()))
     return draw(jax.random.split(KEY, number))
@@ -219,12 +221,12 @@ def test_squares_in_numbers():
     p = np.array([[25.0, -1.0]]), np.array([[0.5, 0.0]])
     q = np.array([[22.0, 1.0]]), np.array([[0.0, -1.0]])
     # The first mean counts as 20: 2² + 2² + 0.5² + 1².
-    np.testing.assert_allclose(rewiring.squared_differences(p, q), [9.25])
+    np.testing.assert_allclose(squared_differences(p, q), [9.25])
 
 
 @jax.jit
 def penalty_and_gradient(options, params, state, mode, noise):
-    method = rewiring.rewire(SPEC, options)
+    method = rewire(SPEC, options)
 
     def loss(params, other):
         context = Context(mode, other, noise, KEY)
@@ -349,7 +351,7 @@ def test_alignment_counts_from_the_second_task_on(form):
     changed = trained(rng, params)
 
     def expected(hidden, adapters):
-        return wiring.alignment_loss(
+        return rewire_losses.alignment_loss(
             hidden, params.hidden, adapters, 0.3, expanded=form == "squares"
         )
 

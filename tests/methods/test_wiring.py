@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewire_jax.methods import wiring
+from rewire_jax.methods import rewire_losses, wiring
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
+from rewire_jax.nn.wired_layers import wired
 
 OBSERVATIONS, N, OUTPUTS, BATCH = 5, 16, 4, 9
 
@@ -85,10 +86,10 @@ def test_wired_network_equals_permuted_activations(double, batch):
     observation = rng.normal(size=(batch, OBSERVATIONS))
     weight = rng.normal(size=(batch, OUTPUTS))
 
-    def wired(hidden, head, scores, tau):
+    def network(hidden, head, scores, tau):
         x = observation
         for layer, v in zip(hidden, scores, strict=True):
-            x = networks.activate(wiring.wired(layer, v, tau, x))
+            x = networks.activate(wired(layer, v, tau, x))
         return networks.affine(head, x)
 
     def dense(hidden, head, scores, tau):
@@ -104,7 +105,7 @@ def test_wired_network_equals_permuted_activations(double, batch):
         )
         return value, pull(weight)
 
-    ours = jax.jit(functools.partial(both, wired))
+    ours = jax.jit(functools.partial(both, network))
     theirs = jax.jit(functools.partial(both, dense))
     for tau in (1.0, 0.1, 0.01):
         got = ours(tau)
@@ -122,7 +123,7 @@ def test_fold_has_the_value_of_wired(double, batch):
         np.testing.assert_array_equal(layer.weight, matrix(z) @ plain.weight)
         np.testing.assert_array_equal(layer.bias, matrix(z) @ plain.bias)
         x = rng.normal(size=(batch, plain.weight.shape[1]))
-        value = wiring.wired(plain, v, 0.1, x)
+        value = wired(plain, v, 0.1, x)
         np.testing.assert_allclose(value, networks.affine(layer, x), rtol=1e-12)
 
 
@@ -178,7 +179,7 @@ def test_exact_recovery(depth, double):
     for index, layer in enumerate(wiring.adapt(previous, adapters, 0.1)):
         np.testing.assert_array_equal(layer.weight, hidden[index].weight)
         np.testing.assert_array_equal(layer.bias, hidden[index].bias)
-    assert wiring.alignment_loss(hidden, previous, adapters, 0.1) == 0
+    assert rewire_losses.alignment_loss(hidden, previous, adapters, 0.1) == 0
 
 
 @pytest.mark.parametrize("depth", [1, 2, 3])
@@ -208,7 +209,7 @@ def test_identity_adapters_change_nothing():
         np.testing.assert_array_equal(refined, orders)
         assert refined.dtype == np.int32
         hidden = make_hidden(rng, depth)
-        assert wiring.alignment_loss(hidden, hidden, identity, 0.1) == 0
+        assert rewire_losses.alignment_loss(hidden, hidden, identity, 0.1) == 0
 
 
 @pytest.mark.parametrize("form", ["norm", "expanded"])
@@ -234,7 +235,7 @@ def test_alignment_loss_equals_the_dense_form(form, double):
         return loss
 
     ours = functools.partial(
-        wiring.alignment_loss, tau=tau, expanded=form == "expanded"
+        rewire_losses.alignment_loss, tau=tau, expanded=form == "expanded"
     )
     other = make_hidden(rng, depth)
     nearly = jax.tree.map(lambda x: x + 0.1 * rng.normal(size=x.shape), moved)
@@ -256,7 +257,7 @@ def test_forms_of_alignment_differ_by_a_constant(double):
     for hidden in (moved, make_hidden(rng, 3)):
         adapters = realigned(rng, 3)[2]
         norm, expanded = (
-            wiring.alignment_loss(hidden, previous, adapters, 0.1, expanded=e)
+            rewire_losses.alignment_loss(hidden, previous, adapters, 0.1, expanded=e)
             for e in (False, True)
         )
         np.testing.assert_allclose(norm, expanded + constant, rtol=1e-12)
@@ -272,7 +273,7 @@ def test_descent_finds_a_permutation(double):
     hidden = list(wiring.fold(previous, np.stack([swapped, orders[1]])))
     hidden[1] = hidden[1]._replace(weight=hidden[1].weight[:, swapped])
     adapters = wiring.identity_adapters(2, N)
-    loss = jax.jit(jax.value_and_grad(wiring.alignment_loss, 2))
+    loss = jax.jit(jax.value_and_grad(rewire_losses.alignment_loss, 2))
     first, _ = loss(hidden, previous, adapters, 0.1)
     for _ in range(200):
         value, gradient = loss(hidden, previous, adapters, 0.1)

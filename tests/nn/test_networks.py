@@ -1,6 +1,9 @@
 import functools
 import itertools
 
+import chex
+import flax.errors
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +24,8 @@ def density(action, mean, std):
 def test_layers_are_uniform_within_torchs_bound():
     sizes = [9, 200, 50]
     layers = jax.jit(lambda key: networks.init_mlp(key, sizes))(KEY)
-    assert [layer.weight.shape for layer in layers] == [(200, 9), (50, 200)]
-    assert [layer.bias.shape for layer in layers] == [(200,), (50,)]
+    chex.assert_shape([layer.weight for layer in layers], [(200, 9), (50, 200)])
+    chex.assert_shape([layer.bias for layer in layers], [(200,), (50,)])
     for layer, inputs in zip(layers, sizes, strict=False):
         for values in layer:
             scaled = np.ravel(values) * np.sqrt(inputs)
@@ -47,6 +50,90 @@ def test_mlp_is_affine_layers_with_leaky_relu_between():
     np.testing.assert_allclose(
         jax.jit(networks.mlp)(layers, inputs), x, rtol=1e-4, atol=1e-5
     )
+
+
+def drawn(key, sizes):
+    """The first parameters from the key, without any of the package's functions."""
+    layers = []
+    keys = jax.random.split(key, len(sizes) - 1)
+    for key, (inputs, outputs) in zip(keys, itertools.pairwise(sizes), strict=True):
+        bound = inputs**-0.5
+        weight, bias = (
+            jax.random.uniform(key, shape, minval=-bound, maxval=bound)
+            for key, shape in zip(
+                jax.random.split(key), [(outputs, inputs), (outputs,)], strict=True
+            )
+        )
+        layers.append({"weight": weight, "bias": bias})
+    return layers
+
+
+def assert_same(actual, expected):
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, actual, expected)
+
+
+@pytest.mark.parametrize("sizes", [[3, 8, 8, 2], [5, 4]])
+def test_the_module_draws_and_stores_what_runs_always_have(sizes):
+    expected = drawn(KEY, sizes)
+    module = networks.MLP(sizes[1:])
+    variables = module.init(KEY, jnp.zeros((6, sizes[0])))
+    named = {f"layers_{i}": layer for i, layer in enumerate(expected)}
+    assert_same(variables, {"params": named})
+    stored = tuple(networks.Linear(**layer) for layer in expected)
+    assert_same(networks.init_mlp(KEY, sizes), stored)
+    assert_same(networks.as_layers(variables), stored)
+    assert_same(networks.as_variables(stored), variables)
+
+    both = jax.random.split(KEY)
+    stacked = jax.jit(jax.vmap(lambda key: networks.init_mlp(key, sizes)))(both)
+    for i, key in enumerate(both):
+        one = tuple(networks.Linear(**layer) for layer in drawn(key, sizes))
+        assert_same(jax.tree.map(lambda x, i=i: x[i], stacked), one)
+
+
+def test_the_module_applies_what_the_stored_layers_do():
+    sizes = [3, 8, 8, 2]
+    layers = networks.init_mlp(KEY, sizes)
+    x = jax.random.normal(jax.random.key(1), (20, 3))
+
+    @jax.jit
+    def plain(layers, x):
+        for layer in layers[:-1]:
+            x = networks.activate(networks.affine(layer, x))
+        return networks.affine(layers[-1], x)
+
+    module = jax.jit(networks.MLP(sizes[1:]).apply)(networks.as_variables(layers), x)
+    np.testing.assert_array_equal(module, plain(layers, x))
+    np.testing.assert_array_equal(jax.jit(networks.mlp)(layers, x), plain(layers, x))
+    bent = networks.MLP(sizes[1:], activation=jnp.tanh)
+    output = x.astype(np.float64)
+    for number, (weight, bias) in enumerate(layers):
+        output = (np.tanh(output) if number else output) @ np.asarray(weight.T) + bias
+    got = bent.apply(networks.as_variables(layers), x)
+    np.testing.assert_allclose(got, output, rtol=1e-4, atol=1e-5)
+
+
+def test_the_module_is_a_part_of_others():
+    class Two(nn.Module):
+        @nn.compact
+        def __call__(self, x):
+            return networks.MLP([8, 2])(x), networks.MLP([8, 2])(x)
+
+    variables = Two().init(KEY, jnp.ones(3))
+    first, second = (
+        networks.as_layers({"params": p}) for p in variables["params"].values()
+    )
+    chex.assert_trees_all_equal_shapes(first, second)
+    assert not np.any(np.isin(first[0].weight, second[0].weight))
+
+
+def test_wrong_inputs_are_refused():
+    variables = networks.as_variables(networks.init_mlp(KEY, [3, 8, 2]))
+    with pytest.raises(flax.errors.ScopeParamShapeError):
+        networks.MLP([8, 2]).apply(variables, jnp.ones(4))
+    with pytest.raises(AssertionError):
+        networks.MLP([8, 2]).apply(variables, jnp.ones(3, int))
 
 
 def test_derivatives_are_those_of_plain_products():
@@ -118,8 +205,7 @@ def test_log_densities_add_up_over_actions():
     action, log_density = jax.jit(networks.sample_action)(
         random.normal(size=mean.shape).astype(np.float32), mean, log_std
     )
-    assert action.shape == (5, 4, 3)
-    assert log_density.shape == (5, 4)
+    chex.assert_shape([action, log_density], [(5, 4, 3), (5, 4)])
     each = np.log(density(action, mean, np.exp(log_std)))
     np.testing.assert_allclose(log_density, each.sum(-1), rtol=1e-2, atol=1e-2)
 

@@ -1,5 +1,6 @@
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,8 +56,7 @@ theirs = jax.jit(functools.partial(value_and_gradients, dense))
 
 def assert_close(actual, expected, rtol=1e-10, floor=0.0):
     """Relative to the largest entry: single ones may be sums that cancel."""
-    assert actual.shape == expected.shape
-    assert actual.dtype == expected.dtype
+    chex.assert_trees_all_equal_shapes_and_dtypes(actual, expected)
     size = max(np.max(np.abs(expected), initial=0.0), floor)
     np.testing.assert_allclose(actual, expected, rtol=0, atol=rtol * size)
 
@@ -119,6 +119,24 @@ def test_any_leading_dimensions(shape, double):
     got = ours(x, scores, 0.1, weight)
     for a, b in zip(got, theirs(x, scores, 0.1, weight), strict=True):
         assert_close(a, b)
+
+
+@pytest.mark.parametrize(
+    ("x", "scores", "tau"),
+    [
+        (jnp.ones((2, 3)), jnp.ones(4), 1.0),
+        (jnp.ones(()), jnp.ones(1), 1.0),
+        (jnp.ones((2, 3)), jnp.ones((1, 3)), 1.0),
+        (jnp.ones((2, 3)), jnp.ones(3), jnp.ones(1)),
+        (jnp.ones((2, 3), int), jnp.ones(3), 1.0),
+        (jnp.ones((2, 3)), jnp.ones(3, int), 1.0),
+    ],
+)
+def test_what_does_not_fit_is_refused(x, scores, tau):
+    with pytest.raises(AssertionError):
+        permute(x, scores, tau)
+    with pytest.raises(AssertionError):
+        jax.eval_shape(jax.grad(lambda x: jnp.sum(permute(x, scores, tau))), x)
 
 
 def test_ties_keep_their_place():

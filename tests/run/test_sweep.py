@@ -22,7 +22,8 @@ from rewire_jax.core.settings import Settings
 from rewire_jax.methods import METHODS, Entry
 from rewire_jax.methods.base import Method, Spec
 from rewire_jax.methods.regularization import FtL2Settings
-from rewire_jax.methods.rewire import RewireSettings, rewire
+from rewire_jax.methods.rewire import rewire
+from rewire_jax.methods.rewire_settings import RewireSettings
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 from rewire_jax.nn.permutation import permute

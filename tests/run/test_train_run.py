@@ -222,6 +222,8 @@ def test_policies_load_from_the_folder_alone(run: Path, tmp_path: Path) -> None:
     environment = prepared.scenario.environment
     for task, seed in ((0, 0), (2, 1)):
         policy = rewire_jax.load_policy(copy, task=task, seed=seed)
+        with pytest.raises(AssertionError):
+            policy(jnp.zeros(prepared.spec.observations + 1))
         one = jnp.asarray([0.3, -0.2])
         many = jnp.stack([one, -one, 2 * one])
         single = jax.jit(policy)(one)

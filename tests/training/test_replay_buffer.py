@@ -170,3 +170,30 @@ def test_members_have_buffers_of_their_own():
     np.testing.assert_array_equal(
         np.asarray(buffers.observation)[:, 1, 0, 0], 20 + values
     )
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"action": jnp.zeros((ENVS, WIDTHS["action"] + 1))},
+        {"reward": jnp.zeros((ENVS, 1))},
+        {"next_obs": jnp.zeros((ENVS, 3))},
+        {"final_obs": jnp.zeros(2)},
+        {"terminal": jnp.zeros(ENVS)},
+    ],
+)
+def test_what_does_not_fit_is_refused(wrong):
+    buffer = replay_buffer.create(
+        jnp.zeros((ENVS, 2)), transitions=4, actions=WIDTHS["action"], episode_length=2
+    )
+    right = {
+        "action": jnp.zeros((ENVS, WIDTHS["action"])),
+        "reward": jnp.zeros(ENVS),
+        "terminal": jnp.zeros(ENVS, bool),
+        "truncated": jnp.zeros(ENVS, bool),
+        "final_obs": jnp.zeros((ENVS, 2)),
+        "next_obs": jnp.zeros((ENVS, 2)),
+    }
+    replay_buffer.add(buffer, 0, **right, episode_length=2)
+    with pytest.raises(AssertionError):
+        replay_buffer.add(buffer, 0, **right | wrong, episode_length=2)

@@ -1,0 +1,98 @@
+"""The losses of the rewiring method: L_KL (Eq. 6), L_reg (Eq. 7) and L_SP (Eq. 11).
+
+The policy's loss is SAC's plus alpha L_KL plus beta L_SP; `penalty` in `rewire.py`
+adds them up.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from rewire_jax.methods.wiring import Adapters, adapt
+from rewire_jax.nn.networks import Linear
+
+Gaussian = tuple[jax.Array, jax.Array]
+"""Mean and log-std, `[..., actions]` each."""
+
+
+def distillation_loss(
+    other: Gaussian, own: Gaussian, form: Literal["kl", "squares"]
+) -> jax.Array:
+    """L_KL, how far the mode in use is from another one (Eq. 6).
+
+    Args:
+      other: the other mode's Gaussians, without gradient.
+      own: those of the mode in use.
+      form: see `RewireSettings.distillation`.
+
+    Returns:
+      `[]`, the mean over states.
+    """
+    divergence = gaussian_kl if form == "kl" else squared_differences
+    return jnp.mean(divergence(jax.lax.stop_gradient(other), own))
+
+
+def gaussian_kl(p: Gaussian, q: Gaussian) -> jax.Array:
+    """KL(p || q) `[...]` of diagonal Gaussians (Eq. 6).
+
+    Squashing both by the same tanh does not change it.
+    """
+    (p_mean, p_log_std), (q_mean, q_log_std) = p, q
+    ratio = jnp.exp(2 * (p_log_std - q_log_std))
+    distance = ((p_mean - q_mean) * jnp.exp(-q_log_std)) ** 2
+    return jnp.sum(0.5 * (ratio + distance - 1) + q_log_std - p_log_std, axis=-1)
+
+
+def squared_differences(p: Gaussian, q: Gaussian) -> jax.Array:
+    """Summed squares of the differences of mean (p's within ±20) and log-std, `[...]`.
+
+    The authors' code takes it in place of `gaussian_kl`.
+    """
+    (p_mean, p_log_std), (q_mean, q_log_std) = p, q
+    mean = (jnp.clip(p_mean, -20, 20) - q_mean) ** 2
+    return jnp.sum(mean + (p_log_std - q_log_std) ** 2, axis=-1)
+
+
+def alignment_loss(
+    hidden: Sequence[Linear],
+    previous: Sequence[Linear],
+    adapters: Adapters,
+    tau: ArrayLike,
+    *,
+    expanded: bool = False,
+) -> jax.Array:
+    """L_SP, the squared distance to the adapted previous weights and biases (Eq. 11).
+
+    Args:
+      hidden: current layers.
+      previous: layers at the end of the previous task.
+      adapters: their permutation.
+      tau: temperature of the adapters' relaxation.
+      expanded: leave out the square of the adapted weights, constant under true
+        permutations but not under their relaxation (the authors' code).
+
+    Returns:
+      `[]`.
+    """
+    adapted = adapt(previous, adapters, tau)
+    if not expanded:
+        return weight_loss(hidden, adapted)
+    return sum(
+        (jnp.sum(now**2 - 2 * now * then) for now, then in _pairs(hidden, adapted)),
+        jnp.zeros(()),
+    )
+
+
+def weight_loss(hidden: Sequence[Linear], previous: Sequence[Linear]) -> jax.Array:
+    """L_reg, the squared distance of weights and biases to other ones (Eq. 7), `[]`."""
+    return sum(
+        (jnp.sum((now - then) ** 2) for now, then in _pairs(hidden, previous)),
+        jnp.zeros(()),
+    )
+
+
+def _pairs(hidden, others) -> Iterable[tuple[jax.Array, jax.Array]]:
+    return zip(jax.tree.leaves(hidden), jax.tree.leaves(others), strict=True)
