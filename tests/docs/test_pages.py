@@ -5,6 +5,7 @@ import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import jax
@@ -39,8 +40,8 @@ def execute(page: str) -> None:
         example.evaluate()
 
 
-def shrunk(run: Callable[..., Path]) -> Callable[..., Path]:
-    """`train` or `sweep` with budgets of seconds."""
+def shrunk(run: Callable[..., Any]) -> Callable[..., Any]:
+    """`train`, `sweep` or `make_train` with budgets of seconds."""
     return lambda settings, *rest, **more: run(small(settings), *rest, **more)
 
 
@@ -50,6 +51,7 @@ def newcomer(tmp_path: Path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rewire_jax, "train", shrunk(rewire_jax.train))
     monkeypatch.setattr(rewire_jax, "sweep", shrunk(rewire_jax.sweep))
+    monkeypatch.setattr(rewire_jax, "make_train", shrunk(rewire_jax.make_train))
     with (
         mock.patch.dict(scenarios.DOMAINS),
         mock.patch.dict(scenarios.SCENARIOS),
