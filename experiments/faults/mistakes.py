@@ -187,7 +187,7 @@ _CONTRADICTORY = (
     Mistake(("train", "probe/reech", *TRAIN[2:], "--out", "{out}"), "probe/reach"),
     Mistake(TRAIN, "--out"),
     Mistake(_sweep(), "axis"),
-    Mistake(_sweep("--k"), "'k'"),
+    Mistake(_sweep("--k"), "modes"),
     Mistake(_sweep("--axis", "betta", "1", "2"), "betta"),
     Mistake(_sweep("--axis", "hidden", "8", "16"), "hidden"),
     Mistake(_sweep("--beta", "1", "x"), "beta"),
