@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 PROG = "rewire-jax"
 _HELP = {"-h", "--help"}
-_EXAMPLE = "halfcheetah/forgetting"  # of which `rewire-jax train --help` tells
+_EXAMPLE = "halfcheetah/forgetting"  # whose defaults `train --help` shows
 _AXES = {
     "--k": ("--axis", "modes"),
     "--alpha": ("--axis", "alpha"),
