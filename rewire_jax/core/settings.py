@@ -111,6 +111,8 @@ class SacSettings:
 class Settings:
     """All settings of a run; the run saves them.
 
+    The defaults are the paper's on Brax. `preset` makes a profile's settings.
+
     Attributes:
       scenario: name of the task sequence.
       method: name of the method.
@@ -124,7 +126,7 @@ class Settings:
       paper_interactions: the same in the paper, for comparison in reports.
       envs: parallel environments of a member.
       updates: SAC updates in one round of updates.
-      update_every: steps of all environments between two rounds of updates.
+      update_every: vector steps between two rounds of updates.
       overlap: step the environments on the host during the updates, with the policy
         from before these updates.
       warmup: interactions of each task before its first update.

@@ -271,9 +271,25 @@ class Method(NamedTuple):
 
     It is made by `make(spec, settings)` inside traced code, so that the settings'
     numbers may differ between the members of a population. `task` is a `[]` int,
-    the index in the sequence. Only the first five are needed.
+    the index in the sequence. Only `init`, `distribution`, `policy`, `act` and `size`
+    are required. The type of each function says what it receives and returns.
 
     Attributes:
+      init: parameters and state before the first task.
+      distribution: the policy in training, a Gaussian before the squashing.
+      policy: what acts in a task, for evaluation and for users.
+      act: the Gaussian of such a policy.
+      size: numbers stored.
+      start_task: changes parameters and state when a task starts.
+      extras: data stored with each transition.
+      context: random draws for an update or a step.
+      penalty: a loss added to SAC's policy loss.
+      inspect: metrics for progress reports.
+      adjust_updates: changes the optimiser's updates.
+      critic_input: what critics see besides the action.
+      consolidate: changes parameters and state after a task's interactions.
+      candidates: policies to choose from at a task's end.
+      end_task: changes parameters and state at a task's end.
       critic_extra: numbers in `critic_input` beyond the observation.
       fresh_critic: whether the critics, too, start anew with each task.
       offline: updates from the buffer after `consolidate`, which they need, a share of

@@ -52,7 +52,9 @@ METHODS: dict[str, Entry] = {
     "pnn": Entry(pnn.pnn, pnn.PnnSettings, pnn.preset),
     "sac_n": Entry(finetune.sac_n, finetune.FinetuneSettings, finetune.preset),
     "ft_n": Entry(finetune.ft_n, finetune.FinetuneSettings, finetune.preset),
-    "csp": Entry(csp, csp_settings.CspSettings, csp_settings.preset, 1),
+    "csp": Entry(
+        csp, csp_settings.CspSettings, csp_settings.preset, selection_episodes=1
+    ),
     "rewire": Entry(
         rewire,
         rewire_settings.RewireSettings,

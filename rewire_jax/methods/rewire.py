@@ -158,18 +158,18 @@ def penalty(
     observation: jax.Array,
     gaussian: Gaussian,
 ) -> tuple[jax.Array, Metrics]:
-    """Alpha L_KL + beta L_SP, both without a meaning for a single mode or task."""
+    """512 alpha L_KL + beta L_SP. L_KL is 0 with one mode, L_SP in the first task."""
     options = design.options
     scores = params.scores[context.other]
     other = forward(design, params, state, scores, key, observation)
     l_kl = distillation_loss(other, gaussian, options.distillation)
     l_kl = jnp.where(design.modes > 1, l_kl, 0.0)
     loss = options.alpha * DISTILLED_STATES * l_kl
-    l_sp = alignment(design, params, state)
+    l_sp = alignment_penalty(design, params, state)
     return loss + options.beta * l_sp, {"distillation": l_kl}
 
 
-def alignment(design: Design, params: Params, state: State) -> jax.Array:
+def alignment_penalty(design: Design, params: Params, state: State) -> jax.Array:
     """L_SP or, with alignment "off", L_reg; 0 in the first task."""
     options = design.options
     if options.alignment == "off":
@@ -237,7 +237,7 @@ def inspect(
     return {
         "mode_divergence": total / jnp.maximum(modes * (modes - 1), 1),
         # Its gradient needs less than its value: updates do without.
-        "alignment": alignment(design, params, state),
+        "alignment": alignment_penalty(design, params, state),
     }
 
 

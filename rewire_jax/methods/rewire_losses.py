@@ -21,7 +21,7 @@ Gaussian = tuple[jax.Array, jax.Array]
 def distillation_loss(
     other: Gaussian, own: Gaussian, form: Literal["kl", "squares"]
 ) -> jax.Array:
-    """L_KL, how far the mode in use is from another one (Eq. 6).
+    """L_KL, how far the mode in use is from another one (Eq. 6), or its stand-in.
 
     Args:
       other: the other mode's Gaussians, without gradient.
@@ -66,13 +66,16 @@ def alignment_loss(
 ) -> jax.Array:
     """L_SP, the squared distance to the adapted previous weights and biases (Eq. 11).
 
+    It trains the weights and the adapters. The scores learn from SAC's loss and L_KL.
+
     Args:
       hidden: current layers.
       previous: layers at the end of the previous task.
       adapters: their permutation.
       tau: temperature of the adapters' relaxation.
-      expanded: leave out the square of the adapted weights, constant under true
-        permutations but not under their relaxation (the authors' code).
+      expanded: leave out the square of the adapted weights, as the authors' code does
+        and all profiles do. It is constant under permutations, but not under their
+        relaxation.
 
     Returns:
       `[]`.

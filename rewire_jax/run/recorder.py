@@ -44,7 +44,7 @@ class Recorder:
           report: what happened, as NumPy arrays `[members]`.
           seconds: that it took.
           compiled: whether these include compiling.
-          steps: steps of all environments.
+          steps: vector steps.
         """
         plan, settings, stage = self.plan, self.plan.settings, now.stage
         interactions = now.steps * settings.envs

@@ -31,7 +31,7 @@ class RunState(NamedTuple):
 
     Attributes:
       stage: the task being trained, or to be trained next.
-      steps: steps of all environments made in it.
+      steps: vector steps made in it.
       learner: between tasks, what was learned.
       state: within a task, all of it.
       before: within a task, the candidates' returns at its start, or None.

@@ -1,8 +1,8 @@
 """The files of a run: a header, and tables to which rows are appended.
 
 settings.json     settings, task names, network sizes, provenance
-results.jsonl     a row for each evaluation: stage, task, seed
-training.jsonl    a row for each progress report and seed
+results.jsonl     a row for each member and task of an evaluation
+training.jsonl    a row for each progress report and member
 timing.jsonl      a row for each progress report: wall-clock seconds
 checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
 .lock             is locked by the process that trains

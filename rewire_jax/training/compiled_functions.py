@@ -22,11 +22,11 @@ class Program(NamedTuple):
 
     Attributes:
       init: `members -> TrainState`.
-      begin: `(members, learner, active, index, task) -> State`, a task's start.
-      chunk: `(members, state, index, task, time, steps) -> state, Report`, takes
-        `steps` steps of all environments; the given state is used up.
+      begin: `(members, learner, active, index, task) -> RunnerState`, a task's start.
+      chunk: `(members, state, index, task, time, steps) -> state, ChunkMetrics`, takes
+        `steps` vector steps; the given state is used up.
       consolidate: `(members, state, index, time) -> TrainState`, the end of a task's
-        interactions, `time` steps of all environments; or None.
+        interactions, `time` vector steps; or None.
       offline_update: `(members, state, index, time, done, steps) -> state`, updates
         from the buffer as in `steps` steps, `done` of which were made before.
       candidates: `(members, learner, index) -> Candidates`, or None.

@@ -41,7 +41,7 @@ def sample_noise(
 
     Args:
       key: a random key.
-      time: `[]` int, steps of all environments so far in the task.
+      time: `[]` int, vector steps so far in the task.
       size: shape of the actions, `envs, actions`.
       random: number of steps at the start of the task with uniform actions.
       sequence: the coloured noise that contains this step; None for white noise.

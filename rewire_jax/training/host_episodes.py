@@ -107,7 +107,7 @@ def replay_actions(
       roots: as in `advance`.
       episodes: as in `advance`.
       buffer: replay buffers `[members]`, which hold the episodes' actions.
-      time: steps of all environments in the buffers.
+      time: vector steps in the buffers.
 
     Raises:
       UserError: they come out elsewhere.

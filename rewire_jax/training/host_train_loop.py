@@ -1,6 +1,6 @@
 """The loop of a task whose environments are stepped on the host.
 
-It makes the same steps, updates and random draws as `training.train`; only where
+It makes the same steps, updates and random draws as `train_loop.run_chunk`; only where
 environments are stepped differs.
 """
 
@@ -50,16 +50,16 @@ class _Functions(NamedTuple):
 
     Attributes:
       roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
-      begin: `(members, learner, active, index, episodes) -> State`.
+      begin: `(members, learner, active, index, episodes) -> RunnerState`.
       draws: `(members, index, time) -> ActionNoise` `[members, every]`, of the
         next steps: drawn for each alone, they would take half of an action's time.
       act: `(members, draws, number, acting, extras, observation, steps) -> actions,
         extras`, by the draw with that number; on the CPU, where it waits for no other
         device's updates.
       store_and_update: `(members, learner, buffer, active, index, time, played) ->
-        learner, buffer, active, metrics`, stores `LoopConfig.every` steps and makes the
-        updates that are due after them; what is given is used up, but for the learner
-        with overlap.
+        learner, buffer, active, metrics`, stores `LoopConfig.update_every` steps and
+        makes the updates that are due after them. It uses up what it is given, except
+        the learner with overlap.
       inspect: `(members, learner, buffer, index, time) -> metrics`.
     """
 
@@ -133,7 +133,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         sequences = None
         if sac.noise_color:
             # All that a turn may touch, each drawn once.
-            starts = time + length * jnp.arange((shape.every - 2) // length + 2)
+            starts = time + length * jnp.arange((shape.update_every - 2) // length + 2)
             sequences = jax.vmap(
                 lambda start: exploration.sample_colored(key, start, size, length, sac)
             )(starts)
@@ -144,10 +144,10 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
                 sequence = sequences[now // length - time // length]
             collect_key = random_keys.of_step(key, now).collect
             return exploration.sample_noise(
-                collect_key, now, size, shape.random, sequence
+                collect_key, now, size, shape.random_steps, sequence
             )
 
-        return jax.vmap(of_step)(time + jnp.arange(shape.every))
+        return jax.vmap(of_step)(time + jnp.arange(shape.update_every))
 
     def act(members, draws, number, acting, extras, observation, steps):
         def one(member, draws, acting, extras, observation, steps):
@@ -163,8 +163,8 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
             at = time + number
             return train_loop.store(buffer, at, action, extras, step, length)
 
-        buffer = jax.lax.fori_loop(0, shape.every, store, buffer)
-        done = time + shape.every
+        buffer = jax.lax.fori_loop(0, shape.update_every, store, buffer)
+        done = time + shape.update_every
         step_keys = random_keys.of_step(of.keys(member, index).steps, done - 1)
         state, metrics = train_loop.update_from_buffer(
             step_keys.update,
@@ -222,8 +222,8 @@ def _chunk(
     time: int,
     steps: int,
 ) -> tuple[train_loop.RunnerState, ChunkMetrics]:
-    """Collects and learns for some steps, a multiple of `LoopConfig.every`."""
-    assert steps % shape.every == 0
+    """Collects and learns for some steps, a multiple of `LoopConfig.update_every`."""
+    assert steps % shape.update_every == 0
     learner, (buffer, episodes, extras), active, acting = state
     episodes = jax.tree.map(np.asarray, episodes)
     lanes = open_lanes(environment, episodes.steps.size)
@@ -239,10 +239,10 @@ def _chunk(
     made, metrics, updates = [], [], 0
     # JAX begins what one thread asks for in turn: actions would wait for updates.
     with ThreadPoolExecutor(1) as other:
-        for start in range(time, time + steps, shape.every):
+        for start in range(time, time + steps, shape.update_every):
             played = []
             draws = here(functions.draws(members, index, start))
-            for number in range(shape.every):
+            for number in range(shape.update_every):
                 drawn, extras = functions.act(
                     actors,
                     draws,
@@ -259,7 +259,7 @@ def _chunk(
                 played.append((action, jax.tree.map(np.asarray, extras), step))
             along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
             made.append(along[2])
-            updates += int(shape.due(start + shape.every))
+            updates += int(shape.due(start + shape.update_every))
             if learning:
                 learner, buffer, active, values = learning.result()
                 metrics.append(values)

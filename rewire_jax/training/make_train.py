@@ -90,8 +90,8 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
     The key `jax.random.key(seed)` gives the results of a run with this seed.
 
     Args:
-      settings: of the run, for instance from `preset`. What is said of seeds,
-        checkpoints and `overlap` is not used.
+      settings: of the run, for instance from `preset`. Its `seed`, `seeds`,
+        `checkpoint_every` and `overlap` are ignored: pass a key for each seed.
       scenario: one of your own; otherwise made from the settings.
 
     Raises:

@@ -22,7 +22,7 @@ class MemberFunctions:
     """Functions of one member; all that they hold is static.
 
     `member` is an entry of `Members`, `index` the `[]` int of a task in the sequence,
-    `time` the steps of all environments made in it.
+    `time` the vector steps made in it.
 
     Attributes:
       environment: of the scenario.
@@ -109,7 +109,7 @@ class MemberFunctions:
     ) -> tuple[RunnerState, train_loop.ChunkMetrics]:
         """Collects and learns for some steps of compiled environments."""
         assert isinstance(self.environment, Environment)
-        return train_loop.train(
+        return train_loop.run_chunk(
             self.keys(member, index).steps,
             state,
             task,

@@ -88,7 +88,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         if all(task == order[i % p] for i, task in enumerate(order))
     )
     entry = find_method(method)
-    paper = Settings(
+    base = Settings(
         scenario=scenario.name,
         method=method,
         profile=profile,
@@ -104,23 +104,24 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     )
     if profile == "authors":
         sac = dataclasses.replace(
-            paper.sac, critic_entropy="batch_mean", policy_states="both"
+            base.sac, critic_entropy="batch_mean", policy_states="both"
         )
-        paper = dataclasses.replace(
-            paper,
+        base = dataclasses.replace(
+            base,
             sac=sac,
             eval_episodes=5_120,
             selection_episodes=entry.selection_episodes or 1_280,
         )
     if _on_continual_world(scenario):
-        return _continual_world(paper)
+        return _continual_world(base)
     if profile != "quick":
-        return paper
+        return base
     interactions = min(38_400, scenario.interactions)
     return dataclasses.replace(
-        paper,
+        base,
         tasks=period,
         interactions=interactions,
+        # As many updates for each interaction as 64 for 128 environments.
         envs=32,
         updates=16,
         warmup=min(2_560, interactions // 4),
@@ -131,7 +132,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
         # From 2, at the paper's rate, the temperature would stay so high that the
         # policy is random for the whole profile.
         sac=dataclasses.replace(
-            paper.sac,
+            base.sac,
             hidden=128,
             lr_critic=1e-3,
             initial_temperature=0.1,
@@ -139,11 +140,11 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     )
 
 
-def _continual_world(paper: Settings) -> Settings:
-    """One environment; 50 steps, then 50 updates; 1,000 random steps first."""
-    start = min(1_000, paper.interactions // 4)
-    paper = dataclasses.replace(
-        paper,
+def _continual_world(base: Settings) -> Settings:
+    """In all profiles: 1 environment; 50 steps, 50 updates; 1,000 random steps first."""
+    start = min(1_000, base.interactions // 4)
+    base = dataclasses.replace(
+        base,
         envs=1,
         updates=50,
         update_every=50,
@@ -154,17 +155,17 @@ def _continual_world(paper: Settings) -> Settings:
         report_every=5_000,
         checkpoint_every=50_000,
     )
-    if paper.profile == "paper":
-        return paper
-    if paper.profile == "authors":
-        played = min(paper.selection_episodes, 10)
-        return dataclasses.replace(paper, eval_episodes=10, selection_episodes=played)
+    if base.profile == "paper":
+        return base
+    if base.profile == "authors":
+        played = min(base.selection_episodes, 10)
+        return dataclasses.replace(base, eval_episodes=10, selection_episodes=played)
     return dataclasses.replace(
-        paper,
-        interactions=min(30_000, paper.interactions),
+        base,
+        interactions=min(30_000, base.interactions),
         eval_episodes=20,
-        selection_episodes=1 if paper.selection_episodes == 1 else 4,
+        selection_episodes=1 if base.selection_episodes == 1 else 4,
         report_every=2_000,
         checkpoint_every=10_000,
-        sac=dataclasses.replace(paper.sac, hidden=128),
+        sac=dataclasses.replace(base.sac, hidden=128),
     )

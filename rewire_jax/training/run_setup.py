@@ -24,7 +24,7 @@ class Budget(NamedTuple):
     """How long a task is, and what choosing between candidates takes.
 
     Attributes:
-      steps: steps of all environments in a task.
+      steps: vector steps in a task.
       offline_steps: after these, steps that only update from the buffer.
       rows: slots for candidates that are rolled out side by side; 0 where nothing is
         to be chosen.
@@ -174,9 +174,9 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
         envs=settings.envs,
         updates=settings.updates,
         warmup=settings.warmup // settings.envs,
-        random=settings.random_interactions // settings.envs,
+        random_steps=settings.random_interactions // settings.envs,
         transitions=min(settings.interactions, settings.buffer) // settings.envs,
-        every=settings.update_every,
+        update_every=settings.update_every,
         overlap=settings.overlap,
     )
     hosted = isinstance(environment, HostEnvironment)

@@ -17,12 +17,12 @@ class LoopConfig(NamedTuple):
     """Static sizes of the loop.
 
     Attributes:
-      envs: parallel environments of a member.
-      updates: SAC updates at a time.
-      warmup: steps of all environments before the first update.
-      random: steps of all environments with uniform actions.
-      transitions: steps of all environments that the buffer holds.
-      every: steps of all environments from one time to the next.
+      envs: parallel environments of a member. A vector step is one step of each.
+      updates: SAC updates in a round.
+      warmup: vector steps before the first round of updates.
+      random_steps: vector steps with uniform actions.
+      transitions: vector steps that the buffer holds.
+      update_every: vector steps between two rounds of updates.
       overlap: whether environments on the host are stepped while updates are made, by
         the policy before these updates.
     """
@@ -30,18 +30,19 @@ class LoopConfig(NamedTuple):
     envs: int
     updates: int
     warmup: int
-    random: int
+    random_steps: int
     transitions: int
-    every: int = 1
+    update_every: int = 1
     overlap: bool = False
 
     def due(self, steps: Any) -> Any:
-        """Whether there are updates after so many steps, an int or `[]`."""
-        return (steps % self.every == 0) & (steps > self.warmup)
+        """Whether a round of updates follows so many vector steps, an int or `[]`."""
+        return (steps % self.update_every == 0) & (steps > self.warmup)
 
     def before(self, steps: Any) -> Any:
-        """Updates made before those that are due after so many steps."""
-        return (steps // self.every - 1 - self.warmup // self.every) * self.updates
+        """Updates in the rounds before the one that follows so many vector steps."""
+        rounds = steps // self.update_every - self.warmup // self.update_every
+        return (rounds - 1) * self.updates
 
 
 class CollectorState(NamedTuple):
@@ -121,10 +122,11 @@ def collect(
     sequence: jax.Array | None,
 ) -> tuple[CollectorState, rollout.Step]:
     """One exploring step of all environments of a member, stored in its buffer."""
-    learner, (buffer, episodes, extras), *_ = state
+    learner = state.learner
+    buffer, episodes, extras = state.collection
     size = shape.envs, environment.action_size
     action, extras = exploration.explore(
-        exploration.sample_noise(key, time, size, shape.random, sequence),
+        exploration.sample_noise(key, time, size, shape.random_steps, sequence),
         (learner.params, learner.method_state),
         extras,
         episodes.state.observation,
@@ -191,7 +193,7 @@ def update_from_buffer(
     Args:
       key: a random key.
       state: the member.
-      time: `[]` int, steps of all environments in the buffer.
+      time: `[]` int, vector steps in the buffer.
       first: `[]` int, updates made before; shared by all members.
       due: `[]` bool, whether there are any; shared by all members.
       updates: how many.
@@ -235,7 +237,7 @@ def update_from_buffer(
     return state._replace(learner=learner, active=active), metrics
 
 
-def train(
+def run_chunk(
     key: jax.Array,
     state: RunnerState,
     task: Task,
@@ -253,7 +255,7 @@ def train(
       key: the task's key; a step's randomness follows from it and the time alone.
       state: the member.
       task: the current task.
-      time: `[]` int, steps of all environments made before in this task. It and
+      time: `[]` int, vector steps made before in this task. It and
         `steps` must be shared by all members.
       steps: `[]` int, steps to make.
       environment: unbatched.

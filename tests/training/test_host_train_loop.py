@@ -446,7 +446,7 @@ def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():
 
 def test_updates_follow_every_so_many_steps():
     shape = train_loop.LoopConfig(
-        1, updates=7, warmup=10, random=0, transitions=9, every=4
+        1, updates=7, warmup=10, random_steps=0, transitions=9, update_every=4
     )
     due = [steps for steps in range(1, 30) if shape.due(steps)]
     assert due == [12, 16, 20, 24, 28]

@@ -336,7 +336,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
     entry = find_method("ft1")
     method = entry.make(spec, entry.preset("", 1, "paper"))
     shape = train_loop.LoopConfig(
-        envs=8, updates=4, warmup=12, random=100, transitions=300
+        envs=8, updates=4, warmup=12, random_steps=100, transitions=300
     )
     steps = 300
 
@@ -357,7 +357,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
             return train_loop.RunnerState(learner, collection, jnp.asarray(True))
 
         def train(key, state, task):
-            return train_loop.train(
+            return train_loop.run_chunk(
                 key,
                 state,
                 task,

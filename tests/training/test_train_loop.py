@@ -21,7 +21,7 @@ TASKS = [task.data for task in SCENARIO.tasks]
 SPEC = Spec(observations=2, actions=2, hidden=18, depth=1, tasks=len(TASKS))
 WARMUP, RANDOM = 5, 12
 SHAPE = train_loop.LoopConfig(
-    envs=4, updates=3, warmup=WARMUP, random=RANDOM, transitions=16
+    envs=4, updates=3, warmup=WARMUP, random_steps=RANDOM, transitions=16
 )
 PLAIN = SacSettings(
     lr_policy=3e-3,
