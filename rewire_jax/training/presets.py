@@ -141,7 +141,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
 
 
 def _continual_world(base: Settings) -> Settings:
-    """In all profiles: 1 environment; 50 steps, 50 updates; first 1,000 random steps."""
+    """In all profiles: 1 environment; 50 steps, 50 updates; random steps at first."""
     start = min(1_000, base.interactions // 4)
     base = dataclasses.replace(
         base,
