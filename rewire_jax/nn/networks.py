@@ -191,7 +191,8 @@ def sample_action(
 
     Returns:
       action `[..., actions]` in (-1, 1) and log-density `[...]` (arXiv 1812.05905,
-      appendix C, with log(1 - tanh²u) written as 2(log 2 - |u| - log(1 + exp(-2|u|))).
+      appendix C). There, log(1 - tanh(u)²) is written as
+      `2 * (log(2) - abs(u) - log(1 + exp(-2 * abs(u))))`.
     """
     raw = mean + jnp.exp(log_std) * noise
     log_density = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
