@@ -39,9 +39,6 @@ class First(Flags):
       profile: of the settings.
       backend: of the settings.
       reward: of the settings.
-      coordinator: of a sweep.
-      processes: of a sweep.
-      process: of a sweep.
     """
 
     words: tyro.conf.Positional[tuple[str, ...]] = ()
@@ -49,9 +46,6 @@ class First(Flags):
     profile: str = "paper"
     backend: str | None = None
     reward: str = "v2"
-    coordinator: str | None = None
-    processes: int | None = None
-    process: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

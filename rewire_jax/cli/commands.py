@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, get_args
 
-import jax
 import tyro
 
 from rewire_jax.core.settings import Settings, require
@@ -92,10 +91,8 @@ class Sweep(Flags):
         then has two values, the ends of its range.
       halving: after each task, keep the best 1 / HALVING of the configurations.
       members_per_batch: most members trained at the same time; 0 for as many as fit.
-      coordinator: HOST:PORT of the first process, for a sweep by several processes. All
-        of them share a file system and run the same command.
-      processes: number of processes; not needed under a cluster manager.
-      process: number of this process, from 0; not needed under a cluster manager.
+      join: help the process that started or resumed the sweep in --out; give the same
+        command otherwise.
       log: also log scalars to tensorboard, wandb, or both.
     """
 
@@ -107,9 +104,7 @@ class Sweep(Flags):
     random: int = 0
     halving: int = 1
     members_per_batch: int = 0
-    coordinator: str | None = None
-    processes: int | None = None
-    process: int | None = None
+    join: bool = False
     log: tuple[str, ...] = ()
 
     def __call__(self, scenario: Scenario) -> None:
@@ -128,9 +123,12 @@ class Sweep(Flags):
             members_per_batch=self.members_per_batch,
             scenario=scenario,
             resume=self.resume,
+            join=self.join,
             log=self.log,
         )
-        if jax.process_index() == 0:
+        if self.join:
+            print(f"finished: `rewire-jax report {folder}` shows the sweep")
+        else:
             print(to_terminal(write_report([folder], folder)), end="")
 
 

@@ -13,9 +13,7 @@ from rich.console import Console
 from rewire_jax.cli import arguments
 from rewire_jax.core.compilation_cache import keep_compiled
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import require
 from rewire_jax.run import interrupts
-from rewire_jax.training import population
 from rewire_jax.version import __version__
 
 _INTERRUPTED = 130
@@ -47,12 +45,6 @@ def _run(words: Sequence[str]) -> None:
         print(f"rewire_jax {__version__}")
         return
     keep_compiled(known.cache)
-    # Processes must join before a scenario is made, which looks for JAX's devices.
-    if known.coordinator:
-        population.join(known.coordinator, known.processes, known.process)
-    else:
-        alone = known.processes is None and known.process is None
-        require(alone, "--processes and --process need --coordinator")
     arguments.command(words, known)()
 
 

@@ -10,7 +10,6 @@ one begins; so the worst can be left out of the next (successive halving, Jamies
 Talwalkar 2016).
 """
 
-import functools
 import math
 import sys
 import time
@@ -38,11 +37,11 @@ from rewire_jax.run.sweep_grid import draws, grid, make_members, read, values_of
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
-from rewire_jax.training import memory_estimate, population
+from rewire_jax.training import memory_estimate
 from rewire_jax.training.population import Member
 from rewire_jax.training.run_setup import Plan, prepare
 
-_POLL = 1.0  # seconds
+_POLL = 1.0  # seconds, to wait for another process
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +71,7 @@ class Sweep:
     progress: Callable[..., Progress]
 
     def run(self) -> None:
-        """Trains what is not finished; each process its own batches.
+        """Trains the batches that no other process trains, until all are finished.
 
         Raises:
           Stopped: interrupted; what is finished is saved.
@@ -80,11 +79,12 @@ class Sweep:
         try:
             for stage in range(self.settings.tasks):
                 batches, num_slots = self.batches(stage)
-                own = range(jax.process_index(), len(batches), jax.process_count())
-                for number in own:
-                    self.train(stage, number, batches, num_slots)
-                # Also at the end: who coordinates must outlive the others.
-                _wait(functools.partial(self.finished, stage, len(batches)))
+                while left := self.unfinished(stage, len(batches)):
+                    claims = [
+                        self.claim(stage, number, batches, num_slots) for number in left
+                    ]
+                    if not any(claims):
+                        time.sleep(_POLL)
         except (Stopped, KeyboardInterrupt):
             raise Stopped(
                 "stopped; what was trained is saved: give the same command with "
@@ -94,13 +94,15 @@ class Sweep:
     def batches(self, stage: int) -> tuple[list[list[int]], int]:
         """Numbers of the members trained on a task, by batch, and a batch's slots."""
         path = batches_of(self.folder, stage)
-        if jax.process_index() == 0 and not path.exists():
-            numbers = self.survivors(stage)
-            size, count = self.share(len(numbers))
-            batches = [numbers[i * size : (i + 1) * size] for i in range(count)]
-            run_folder.make(path.parent)
-            run_folder.write(path, {"size": size, "batches": batches})
-        _wait(path.exists)
+        while not path.exists():
+            with run_folder.claimed(path.parent) as ours:
+                if ours and not path.exists():
+                    numbers = self.survivors(stage)
+                    size, count = self.share(len(numbers))
+                    batches = [numbers[i * size : (i + 1) * size] for i in range(count)]
+                    run_folder.write(path, {"size": size, "batches": batches})
+            if not ours:
+                time.sleep(_POLL)
         return read_batches(path)
 
     def survivors(self, stage: int) -> list[int]:
@@ -124,17 +126,25 @@ class Sweep:
         # In whole rounds of the devices, as slots are.
         most = max(self.most - self.most % devices, min(self.most, devices))
         count = math.ceil(members / most)
-        if members >= jax.process_count():
-            count = jax.process_count() * math.ceil(count / jax.process_count())
         size = math.ceil(members / count)
         if size > devices:
             size = devices * math.ceil(size / devices)
         return size, math.ceil(members / size)
 
-    def finished(self, stage: int, batches: int) -> bool:
-        """Whether all of a task's batches are."""
-        folders = (batch(self.folder, stage, number) for number in range(batches))
-        return all(run_state.finished(folder, stage) for folder in folders)
+    def unfinished(self, stage: int, batches: int) -> list[int]:
+        """A task's batches that are still to be trained."""
+        folders = [batch(self.folder, stage, number) for number in range(batches)]
+        return [n for n, f in enumerate(folders) if not run_state.finished(f, stage)]
+
+    def claim(
+        self, stage: int, number: int, batches: list[list[int]], num_slots: int
+    ) -> bool:
+        """Trains a batch on a task, unless another process does; whether it did."""
+        folder = batch(self.folder, stage, number)
+        with run_folder.claimed(folder) as ours:
+            if ours and not run_state.finished(folder, stage):
+                self.train(stage, number, batches, num_slots)
+        return ours
 
     def plan(self, numbers: Sequence[int], num_slots: int) -> Plan:
         """The plan of a batch."""
@@ -146,10 +156,7 @@ class Sweep:
     ) -> None:
         """Trains a batch on a task, or what is left of that."""
         folder = batch(self.folder, stage, number)
-        if run_state.finished(folder, stage):
-            return
         plan = self.plan(batches[number], num_slots)
-        run_folder.make(folder)
         label = f"{self.settings.method} sweep on {self.settings.scenario}"
         if len(batches) > 1:
             label += f", batch {number + 1} of {len(batches)}"
@@ -182,11 +189,10 @@ class Sweep:
         return loggers.subject(self.folder, self.settings, member, ",".join(facts))
 
     def ahead(self, stage: int, number: int, batches: int) -> int:
-        """Batches that this process is still to train after one."""
-        processes = jax.process_count()
-        left = (batches - number - 1) // processes
+        """Batches still to be trained after one, if no other process trains any."""
+        left = batches - number - 1
         for later in range(1, self.settings.tasks - stage):
-            left += math.ceil(batches / self.halving**later / processes)
+            left += math.ceil(batches / self.halving**later)
         return left
 
     def gather(self, stage: int, plan: Plan) -> RunState:
@@ -224,13 +230,15 @@ def sweep(
     members_per_batch: int = 0,
     scenario: Scenario | None = None,
     resume: bool = False,
+    join: bool = False,
     log: Sequence[str] = (),
     progress: Callable[..., Progress] = Progress,
 ) -> Path:
     """Trains every configuration with every seed as one population.
 
-    Where several processes have joined by `jax.distributed`, all of them must call
-    this alike, on one file system: each trains batches of its own.
+    Several processes can share a sweep in one folder: one starts it, the others call
+    this with the same arguments and `join`. Each trains a batch that no other process
+    trains. If a process ends early, the others finish its batch.
 
     Args:
       settings: what the members share; `seeds` is of each configuration.
@@ -244,6 +252,7 @@ def sweep(
       members_per_batch: trained side by side at most; 0 for as many as fit.
       scenario: one of your own; otherwise made from the settings.
       resume: go on with what is not finished.
+      join: help the process that started the sweep in this folder, or resumed it.
       log: where scalars go, too, as `train` has it.
       progress: makes the display.
 
@@ -272,10 +281,10 @@ def sweep(
     header = _header(
         plan, members, tuple(configurations[0]), given, random=random, halving=halving
     )
-    own = run_folder.held(folder, None if resume else header, "sweep")
     with ExitStack() as stack:
-        population.at_first(lambda: stack.enter_context(own))
-        _wait((folder / run_folder.HEADER).exists)
+        if not join:
+            start = None if resume else header
+            stack.enter_context(run_folder.held(folder, start, "sweep"))
         run_folder.compare(folder, plan.settings, "sweep")
         saved = run_folder.read_header(folder, "sweep")
         require(
@@ -339,9 +348,3 @@ def _header(
         "episode_length": plan.scenario.environment.episode_length,
         "provenance": run_folder.provenance(),
     }
-
-
-def _wait(done: Callable[[], bool]) -> None:
-    """Waits for what another process does; its end, too, would end this one."""
-    while not done():
-        time.sleep(_POLL)

@@ -19,7 +19,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -235,19 +234,12 @@ def _orbax() -> Iterator[tuple[Any, Any]]:
     """Orbax, and a synchronous checkpointer that reports by exceptions alone."""
     # Here, because it takes long to import.
     import orbax.checkpoint as ocp
-    from orbax.checkpoint._src.multihost import multihost
 
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)  # It logs tracebacks when the disk is full.
     try:
-        # Processes that work together write folders of their own, and do not wait. But
-        # Orbax has only the first of them write arrays of the host.
-        options = ocp.options.MultiprocessingOptions(active_processes={0})
-        handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=options)
-        alone = mock.patch.object(multihost, "process_index", return_value=0)
-        checkpointer = ocp.Checkpointer(handler, multiprocessing_options=options)
-        with alone, checkpointer as orbax:
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler()) as orbax:
             yield ocp, orbax
     finally:
         logger.setLevel(level)

@@ -85,6 +85,11 @@ def held(
         _check_vacant(folder)
         make(folder)
     lock = _lock(folder)
+    if lock is None:
+        raise UserError(
+            f"another process trains in {folder}: wait for its end or stop it, then "
+            "go on with --resume; or name another folder with --out"
+        )
     try:
         if header is not None:
             _check_vacant(folder)  # Another process may have been faster.
@@ -94,8 +99,29 @@ def held(
         lock.release()
 
 
-def _lock(folder: Path) -> FileLock:
-    """Locks a folder; the system unlocks it when the process ends, however that is."""
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[bool]:
+    """Locks a folder, made if it is not there, unless another process has.
+
+    Yields whether this process has it.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    make(folder)
+    lock = _lock(folder)
+    try:
+        yield lock is not None
+    finally:
+        if lock:
+            lock.release()
+
+
+def _lock(folder: Path) -> FileLock | None:
+    """Locks a folder; None if another process has.
+
+    The system unlocks it when the process ends, however that is.
+    """
     file = folder / _LOCK
     lock = FileLock(file, timeout=0)
     with writing(folder):
@@ -104,10 +130,7 @@ def _lock(folder: Path) -> FileLock:
         try:
             lock.acquire()
         except Timeout:
-            raise UserError(
-                f"another process trains in {folder}: wait for its end or stop it, "
-                "then go on with --resume; or name another folder with --out"
-            ) from None
+            return None
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise

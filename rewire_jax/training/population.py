@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import SacSettings
 
 _AXIS = "members"
@@ -77,49 +75,6 @@ def stack(members: Sequence[Member]) -> Members:
         sac=stacked([member.sac for member in members]),
         options=stacked([member.options for member in members]),
     )
-
-
-def join(coordinator: str, processes: int | None, process: int | None) -> None:
-    """Makes this process one of several that share the work.
-
-    Args:
-      coordinator: `host:port` of the first process.
-      processes: number of processes; None if a cluster manager that JAX knows sets
-        this and the next.
-      process: number of this process.
-
-    Raises:
-      UserError: a number is missing or wrong, or the other processes do not answer.
-    """
-    try:
-        jax.distributed.initialize(coordinator, processes, process)
-    except (ValueError, TypeError, RuntimeError) as error:
-        said = str(error).partition("\n")[0]
-        raise UserError(
-            f"--coordinator {coordinator}: {said} Check the address, --processes and "
-            "--process."
-        ) from error
-
-
-def at_first(step: Callable[[], Any]) -> None:
-    """Runs a step in the first process only; the other processes wait for it.
-
-    Raises:
-      UserError: the step failed; every process raises the same error.
-    """
-    if jax.process_count() == 1:
-        step()
-        return
-    said = b""
-    if jax.process_index() == 0:
-        try:
-            step()
-        except UserError as error:
-            said = str(error).encode()[:_LONGEST]
-    sent = np.frombuffer(said.ljust(_LONGEST, b"\0"), np.uint8)
-    heard = np.asarray(multihost_utils.broadcast_one_to_all(sent), np.uint8)
-    if text := bytes(heard).rstrip(b"\0"):
-        raise UserError(text.decode(errors="replace"))
 
 
 def mesh(members: int) -> Mesh:

@@ -98,7 +98,6 @@ def test_bad_settings(
         ("sweep probe/reach --out x --axis tau", "--axis"),
         ("sweep probe/reach --out x --axis tau high", "--axis"),
         ("sweep probe/reach --out x --k 1 --axis modes 2", "modes"),
-        ("sweep probe/reach --out x --k 1 2 --process 1", "--coordinator"),
     ],
 )
 def test_bad_arguments(

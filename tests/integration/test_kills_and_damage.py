@@ -5,7 +5,6 @@ import os
 import random
 import shutil
 import signal
-import socket
 import subprocess
 import time
 from functools import cache, partial
@@ -127,36 +126,20 @@ def test_ctrl_c_is_pressed(times, words, seen, rows, unbroken, tmp_path):
     assert times == 2 or all(p.read_bytes().startswith(b) for p, b in before.items())
 
 
-def resumed(*words):
-    return [command.run(*words, "--resume")]
-
-
-def paired(*words):
-    """Two processes that share a sweep."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    shared = ["--coordinator", address, "--processes", "2", "--process"]
-    pair = [command.start(*words, *shared, number) for number in "01"]
-    return [command.end(process) for process in pair]
-
-
 PAIRS = {
-    "run": (RUN, TRAINING, resumed),
-    "sweep": (SWEEP, f"{FIRST}/{TRAINING}", resumed),
-    "sweep of two processes": (SWEEP, f"{FIRST}/{TRAINING}", paired),
+    "run": (RUN, TRAINING),
+    "sweep": (SWEEP, f"{FIRST}/{TRAINING}"),
 }
 
 
-@pytest.mark.parametrize(("words", "seen", "second"), PAIRS.values(), ids=PAIRS)
-def test_a_second_process_comes(words, seen, second, unbroken, tmp_path):
+@pytest.mark.parametrize(("words", "seen"), PAIRS.values(), ids=PAIRS)
+def test_a_second_process_comes(words, seen, unbroken, tmp_path):
     out = tmp_path / "run"
     first = command.start(*words, "--out", out)
     command.wait(first, out, seen, 4)
     first.send_signal(signal.SIGSTOP)  # It must not end before the second has looked.
     try:
-        for ran in second(*words, "--out", out):
-            assert_refused(ran, out, "--out")
+        assert_refused(command.run(*words, "--out", out, "--resume"), out, "--out")
     finally:
         first.send_signal(signal.SIGCONT)
     assert command.end(first).returncode == 0

@@ -136,7 +136,7 @@ def test_what_does_not_fit_is_refused(x, scores, tau):
     with pytest.raises(AssertionError):
         permute(x, scores, tau)
     with pytest.raises(AssertionError):
-        jax.eval_shape(jax.grad(lambda x: jnp.sum(permute(x, scores, tau))), x)
+        jax.eval_shape(permute, x, scores, tau)  # known without computing
 
 
 def test_ties_keep_their_place():

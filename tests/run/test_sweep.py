@@ -3,7 +3,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -256,28 +255,45 @@ def test_devices_train_their_members_without_a_word_to_each_other(
 
 
 def test_two_processes_share_the_batches(swept: Path, tmp_path: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
     folder = tmp_path / "sweep"
-    shared = ["--coordinator", address, "--processes", "2"]
-    processes = [
-        subprocess.Popen(
-            command(folder, *shared, "--process", number),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for number in ("0", "1")
-    ]
+    processes = [begin(command(folder))]
+    while not (folder / "settings.json").exists():
+        assert processes[0].poll() is None
+        time.sleep(0.1)
+    processes.append(begin([*command(folder), "--join"]))
     said = [process.communicate() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], said
-    # Each of them trained a batch of each task, and the first reports.
-    for number, (out, error) in enumerate(said):
-        assert error.count(f"batch {number + 1} of 2") == 2
-        assert error.count("finished in") == 2
-        assert ("sweep.md" in out) == (number == 0)
+    # Of two batches of each task, each was trained once, by whoever was free.
+    batches = [error.count("finished in") for _, error in said]
+    assert sum(batches) == 2 * 2
+    assert "sweep.md" in said[0][0]
+    assert "sweep.md" not in said[1][0]
     near(rows(folder), rows(swept))
+
+
+def test_who_joins_finishes_what_another_process_left(
+    swept: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "sweep"
+    first = begin(command(folder))
+    while not list(folder.glob("task-000/batch-000/checkpoints/*-step-*")):
+        assert first.poll() is None
+        time.sleep(0.1)
+    first.kill()
+    first.communicate()
+    done = run([*command(folder), "--join"])
+    assert done.returncode == 0, done.stderr
+    near(rows(folder), rows(swept))
+
+
+def test_there_must_be_a_sweep_to_join(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no sweep"):
+        run_sweep(tmp_path / "none", small(), axes={"beta": [1, 2]}, join=True)
+
+
+def begin(words: list[str]) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    return subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True)
 
 
 def run_sweep(folder: Path, settings: Settings, **options) -> Path:
@@ -438,12 +454,10 @@ def test_a_sweep_stops_when_asked_to(
         (["--random", "2", "--beta", "1", "nan"], "--beta must be finite"),
         (["--random", "2", "--k", "1.5", "4"], "--modes must be a whole number"),
         (["--beta", "1", "--beta", "2"], "beta is an axis twice"),
-        (["--beta", "1", "--process", "1"], "need --coordinator"),
         (["--beta", "1", "--processes", "two"], "are whole numbers"),
         (["--axis", "tau", "0"], "--tau must be above 0"),
         (["--random", "3", "--beta", "1", "2", "3"], "needs a range"),
         (["--method", "ft1", "--alpha", "1"], "no sweep over 'alpha'"),
-        (["--beta", "1", "--coordinator", "nowhere"], "--coordinator nowhere"),
         (["--beta", "1", "--resume"], "holds no sweep"),
     ],
 )
