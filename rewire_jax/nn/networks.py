@@ -191,7 +191,7 @@ def sample_action(
 
     Returns:
       action `[..., actions]` in (-1, 1) and log-density `[...]` (arXiv 1812.05905,
-      appendix C). There, log(1 - tanh(u)²) is written as
+      appendix C). We write log(1 - tanh(u)²) as
       `2 * (log(2) - abs(u) - log(1 + exp(-2 * abs(u))))`.
     """
     raw = mean + jnp.exp(log_std) * noise
