@@ -217,10 +217,7 @@ class Penalty(Protocol):
 
 
 class Inspect(Protocol):
-    """Returns metrics `[]` by name; called for each progress report.
-
-    `observation` `[batch, observations]` comes from the replay buffer.
-    """
+    """Returns metrics `[]` from `[batch]` observations; called for each report."""
 
     def __call__(
         self, params: Params, state: MethodState, observation: jax.Array, /
