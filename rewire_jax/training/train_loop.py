@@ -70,8 +70,7 @@ class RunnerState(NamedTuple):
       learner: the part that updates change.
       collection: the part that collecting changes.
       active: `[]` bool; if False, the learner is no longer updated.
-      acting: parameters and method's state that act next, with `LoopConfig.overlap`;
-        otherwise `()`.
+      acting: parameters and method's state that act next; `()` without overlap.
     """
 
     learner: sac.TrainState
@@ -127,8 +126,7 @@ def collect(
     """Makes one exploring vector step and stores it in the member's buffer.
 
     `key` is the step's key for collecting. `sequence` `[episode_length, envs, actions]`
-    is coloured noise, or None for white noise. The other arguments are those of
-    `run_chunk`.
+    is coloured noise, None for white. The other arguments are those of `run_chunk`.
     """
     learner = state.learner
     buffer, episodes, extras = state.collection
@@ -203,8 +201,7 @@ def update_from_buffer(
       state: the member.
       time: `[]` int, vector steps made so far in this task.
       first: `[]` int, updates made before in this task; shared by all members.
-      due: `[]` bool, whether to make the round; shared by all members. If it is False,
-        the metrics are zeros.
+      due: `[]` bool, shared by all members; if False, nothing is done.
       updates: number of updates in the round.
       environment: unbatched.
       method: the member's method.
