@@ -238,7 +238,7 @@ def check_kinds(group: Any) -> None:
 
 
 def validate(run: Settings) -> None:
-    """Raises `UserError` if a value of `run` or `run.sac` makes no sense.
+    """Raises `UserError` if a value of `run` or `run.sac` is invalid.
 
     Of the method's own options it checks only the types.
     """
@@ -281,7 +281,7 @@ def from_json(data: dict[str, Any], options: type) -> Settings:
     """The settings that `to_json` wrote; `options` is the method's settings class.
 
     Raises:
-      UserError: if a field is missing or unknown, or its value makes no sense.
+      UserError: if a field is missing or unknown, or its value is invalid.
     """
     try:
         parts = {

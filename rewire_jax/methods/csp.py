@@ -281,7 +281,7 @@ def dirichlet(
       key: a random key.
       slots: length of the weights.
       used: `[]` int, slots in use, at least 1.
-      shape: of the draws.
+      shape: shape of the draws.
       last: `[]`, the concentration of the last slot in use; None for 1.
 
     Returns:

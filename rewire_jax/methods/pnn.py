@@ -32,7 +32,7 @@ class PnnSettings:
     width: int = 96
 
     def checked(self) -> "PnnSettings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         require(self.width >= 1, f"--width must be at least 1, not {self.width}")
         return self
 

@@ -28,7 +28,7 @@ class FtL2Settings:
     coefficient: float = 1.0
 
     def checked(self) -> "FtL2Settings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         _check_coefficient(self.coefficient)
         return self
 
@@ -47,7 +47,7 @@ class EwcSettings:
     fisher_states: int = 1024
 
     def checked(self) -> "EwcSettings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         _check_coefficient(self.coefficient)
         require(
             self.fisher_states >= 1,

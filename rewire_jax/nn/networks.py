@@ -191,7 +191,7 @@ def sample_action(
 
     Returns:
       action `[..., actions]` in (-1, 1) and log-density `[...]` (arXiv 1812.05905,
-      appendix C, with log(1 - tanh²u) written as 2(log 2 - |u| - log(1 + exp(-2|u|))).
+      appendix C, with `log(1 - tanh²u)` as `2(log 2 - |u| - log(1 + exp(-2|u|)))`).
     """
     raw = mean + jnp.exp(log_std) * noise
     log_density = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)

@@ -21,7 +21,7 @@ def heading(
 
     Args:
         subject: what the title begins with.
-        settings: of the run.
+        settings: settings of the run.
         tasks: of the sequence that it has.
         seeds: how many, of each run.
         configurations: how many, each with all seeds; of a run 0.

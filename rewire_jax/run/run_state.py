@@ -119,8 +119,8 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
     What the run's tables hold beyond it is cut off.
 
     Args:
-      folder: of the run.
-      plan: of the run.
+      folder: folder of the run.
+      plan: plan of the run.
       say: is told about every checkpoint that cannot be used.
     """
     for path in checkpoint.available(folder / _FOLDER):
@@ -189,7 +189,7 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
     """The policies kept after a stage, or after the latest one.
 
     Args:
-      folder: of the run.
+      folder: folder of the run.
       stage: of its sequence, or None.
       like: params and method_state, `[members]`, as shapes.
 

@@ -50,7 +50,7 @@ class Sweep:
     """A sweep, prepared.
 
     Attributes:
-      folder: of the sweep.
+      folder: folder of the sweep.
       settings: what all members share; at the axes, the first configuration's.
       scenario: of all members.
       members: all members, the seeds of a configuration side by side.
@@ -242,7 +242,7 @@ def sweep(
       halving: after each task the best 1 / `halving` of the configurations go on, by
         episodes apart from those that are reported; 1 for all.
       members_per_batch: trained side by side at most; 0 for as many as fit.
-      scenario: one of your own; otherwise made from the settings.
+      scenario: your own scenario; if None, the settings name it.
       resume: go on with what is not finished.
       log: where scalars go, too, as `train` has it.
       progress: makes the display.
@@ -251,7 +251,7 @@ def sweep(
       The folder; see this module for what it holds, and `write_report`.
 
     Raises:
-      UserError: settings that make no sense, a folder that does not fit, a full disk.
+      UserError: invalid settings, a folder that does not fit, a full disk.
       Stopped: interrupted, and saved.
     """
     folder = Path(out)

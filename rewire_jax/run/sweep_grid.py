@@ -80,7 +80,7 @@ def configure(settings: Settings, values: Mapping[str, float]) -> Settings:
     """The settings with these values.
 
     Raises:
-      UserError: an unknown setting, or a value that makes no sense.
+      UserError: an unknown setting, or an invalid value.
     """
     kinds = names(settings)
     sac: dict[str, Any] = {}

@@ -49,7 +49,7 @@ class Run:
         """See `train`.
 
         Args:
-          plan: of the run.
+          plan: plan of the run.
           folder: for its tables and checkpoints; it must exist.
           progress: the display.
           logs: its scalars, too; opened by `start`.
@@ -287,9 +287,9 @@ def train(
     """Learns a sequence of tasks; see `run_folder` for what it writes.
 
     Args:
-      settings: of the run, for instance from `preset`.
+      settings: settings of the run, for instance from `preset`.
       out: folder of the run, new or empty, or with `resume` an unfinished run's.
-      scenario: one of your own; otherwise made from the settings.
+      scenario: your own scenario; if None, the settings name it.
       resume: continue from the newest checkpoint that is whole.
       log: where scalars go, too, a log for each member: "tensorboard", "wandb".
       progress: makes the display.

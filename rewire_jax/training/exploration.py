@@ -102,9 +102,9 @@ def sample_colored(
     Args:
       key: the task's, as in `train`.
       time: `[]` int, of the step.
-      size: of the noise in a step.
-      length: of an episode.
-      settings: SAC's.
+      size: shape of the noise in a step.
+      length: steps of an episode.
+      settings: SAC's settings.
     """
     noise_key = random_keys.of_step(key, time - time % length).noise
     return colored_noise.colored(noise_key, settings.noise_color, length, size)

@@ -1,4 +1,4 @@
-"""The members of a population, configurations × seeds, and their devices."""
+"""The members of a population (configurations × seeds), and their devices."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ class Member(NamedTuple):
     """One member.
 
     Attributes:
-      number: in the run or sweep.
+      number: number in the run or sweep.
       name: a label for the user.
       seed: determines all its randomness.
       sac: SAC's settings.
