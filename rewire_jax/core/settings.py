@@ -78,12 +78,12 @@ class SacSettings:
       target_delay: critic updates for each update of the targets.
       time_limit: "terminal" treats a time limit as the end of the return; "bootstrap"
         adds the value of the state there.
-      critic_entropy: the -log π of the next action in the critics' target: "sample"
-        takes that of each action, "batch_mean" the mean over the batch, as broadcasting
-        does in the authors' code.
-      policy_states: states in the losses of policy and temperature: "current" takes the
-        first state of each transition, "both" also the last. After an ended episode,
-        the last state in the authors' code is the first of the next episode.
+      critic_entropy: log-density of the next action in the critics' target: "sample"
+        uses that of each action; "batch_mean" uses the mean over the batch, which has
+        the same gradient as the loss in the authors' code.
+      policy_states: states in the losses of policy and temperature: "current" uses the
+        first state of each transition; "both" uses the first and the next state, as in
+        the authors' code.
       noise_color: color of the exploration noise: 0 is white, 1 pink, 2 red
         (Eberhard et al., ICLR 2023). Updates always draw white noise.
     """

@@ -22,7 +22,7 @@ class FtL2Settings:
     """FT-L2.
 
     Attributes:
-      coefficient: weight of the squared distance to the last task's policy.
+      coefficient: weight of the squared distance to the previous task's parameters.
     """
 
     coefficient: float = 1.0
@@ -38,9 +38,10 @@ class EwcSettings:
     """Elastic weight consolidation.
 
     Attributes:
-      coefficient: weight of the squared distance to the last task's policy, each
-        of its terms times the Fisher information.
-      fisher_states: states of a task that its Fisher information is a mean over.
+      coefficient: weight of the squared distance to the previous task's parameters. The
+        Fisher information multiplies each term of the distance.
+      fisher_states: number of states over which a task's Fisher information is
+        averaged.
     """
 
     coefficient: float = 1.0

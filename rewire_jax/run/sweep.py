@@ -5,9 +5,9 @@ task-000/            the first task
   batches.json       which members are trained on it side by side
   batch-000/         their tables and checkpoints, as a run's (see `run_folder`)
 
-Each task is trained by all members, in batches that fit the memory, before the next
-one begins; so the worst can be left out of the next (successive halving, Jamieson and
-Talwalkar 2016).
+All members are trained on a task, in batches that fit the memory, before the next task
+starts. So the worst members can be dropped between tasks (successive halving, Jamieson
+and Talwalkar 2016).
 """
 
 import functools
@@ -47,18 +47,18 @@ _POLL = 1.0  # seconds
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """A sweep, prepared.
+    """A sweep, ready to run.
 
     Attributes:
       folder: folder of the sweep.
-      settings: what all members share; at the axes, the first configuration's.
-      scenario: of all members.
-      members: all members, the seeds of a configuration side by side.
-      axes: names of the settings in which they differ.
-      halving: of the configurations, one in this many goes on to the next task.
-      most: members trained side by side at most.
-      log: where scalars go, too, as `train` has it.
-      progress: makes the display.
+      settings: settings of the first configuration; others differ only in the axes.
+      scenario: scenario of all members.
+      members: all members; the seeds of a configuration are consecutive.
+      axes: names of the settings in which members differ.
+      halving: one in this many configurations continues with the next task.
+      most: largest number of members trained at the same time.
+      log: loggers that also get the scalars, see `train`.
+      progress: class of the display.
     """
 
     folder: Path
@@ -72,10 +72,10 @@ class Sweep:
     progress: Callable[..., Progress]
 
     def run(self) -> None:
-        """Trains what is not finished; each process its own batches.
+        """Trains all unfinished batches; each process trains its own batches.
 
         Raises:
-          Stopped: interrupted; what is finished is saved.
+          Stopped: interrupted; finished steps are saved.
         """
         try:
             for stage in range(self.settings.tasks):
@@ -83,16 +83,16 @@ class Sweep:
                 own = range(jax.process_index(), len(batches), jax.process_count())
                 for number in own:
                     self.train(stage, number, batches, num_slots)
-                # Also at the end: who coordinates must outlive the others.
+                # Also at the end: the coordinating process must exit last.
                 _wait(functools.partial(self.finished, stage, len(batches)))
         except (Stopped, KeyboardInterrupt):
             raise Stopped(
-                "stopped; what was trained is saved: give the same command with "
-                f"--resume, for {self.folder}"
+                f"stopped and saved in {self.folder}: to continue, repeat the command "
+                "with --resume"
             ) from None
 
     def batches(self, stage: int) -> tuple[list[list[int]], int]:
-        """Numbers of the members trained on a task, by batch, and a batch's slots."""
+        """Returns the members of each batch on a task, and the size of a batch."""
         path = batches_of(self.folder, stage)
         if jax.process_index() == 0 and not path.exists():
             numbers = self.survivors(stage)
@@ -104,7 +104,7 @@ class Sweep:
         return read_batches(path)
 
     def survivors(self, stage: int) -> list[int]:
-        """The members that are to be trained on a task."""
+        """Returns the members to train on a task."""
         if stage == 0:
             return [member.number for member in self.members]
         before = [n for batch in self.batches(stage - 1)[0] for n in batch]
@@ -119,9 +119,9 @@ class Sweep:
         return [n for i in sorted(kept) for n in before[i * seeds : (i + 1) * seeds]]
 
     def share(self, members: int) -> tuple[int, int]:
-        """Places in a batch and how many batches, for so many members."""
+        """Returns the size of a batch and the number of batches."""
         devices = jax.local_device_count()
-        # In whole rounds of the devices, as slots are.
+        # A batch is divided equally between the devices.
         most = max(self.most - self.most % devices, min(self.most, devices))
         count = math.ceil(members / most)
         if members >= jax.process_count():
@@ -132,19 +132,19 @@ class Sweep:
         return size, math.ceil(members / size)
 
     def finished(self, stage: int, batches: int) -> bool:
-        """Whether all of a task's batches are."""
+        """Whether all batches of a task are finished."""
         folders = (batch(self.folder, stage, number) for number in range(batches))
         return all(run_state.finished(folder, stage) for folder in folders)
 
     def plan(self, numbers: Sequence[int], num_slots: int) -> Plan:
-        """The plan of a batch."""
+        """Returns the plan of a batch."""
         members = [self.members[number] for number in numbers]
         return prepare(self.settings, self.scenario, members, num_slots)
 
     def train(
         self, stage: int, number: int, batches: list[list[int]], num_slots: int
     ) -> None:
-        """Trains a batch on a task, or what is left of that."""
+        """Trains a batch on a task, or the rest of it after a stop."""
         folder = batch(self.folder, stage, number)
         if run_state.finished(folder, stage):
             return
@@ -169,20 +169,20 @@ class Sweep:
                 return run.start(now)
 
             with interruptible(run.interrupt, folder, display.message):
-                # Where it stands is not kept here: what was learned before would be.
+                # No variable holds the state, so that its memory can be freed.
                 run.task(start(), self.ahead(stage, number, len(batches)))
             if run.interrupt.stopping:  # since the last chunk
                 raise Stopped
 
     def subject(self, member: Member) -> loggers.Subject:
-        """Whose log a member's is, from one task to the next."""
+        """Returns the log of a member; it is the same for all tasks."""
         values = {name: read(member, name) for name in self.axes}
         facts = [f"{name}={short(value)}" for name, value in values.items()]
         facts = [f"member-{member.number:03d}", *facts, f"seed={member.seed}"]
         return loggers.subject(self.folder, self.settings, member, ",".join(facts))
 
     def ahead(self, stage: int, number: int, batches: int) -> int:
-        """Batches that this process is still to train after one."""
+        """Returns how many batches this process has to train after this one."""
         processes = jax.process_count()
         left = (batches - number - 1) // processes
         for later in range(1, self.settings.tasks - stage):
@@ -190,7 +190,7 @@ class Sweep:
         return left
 
     def gather(self, stage: int, plan: Plan) -> RunState:
-        """A batch's members as they were after the task before, wherever that was."""
+        """Returns a batch's members as saved after the previous task, in any batch."""
         found: dict[int, Any] = {}
         wanted = {member.number for member in plan.members}
         batches, num_slots = self.batches(stage - 1)
@@ -203,7 +203,7 @@ class Sweep:
                 items = run_state.read_kept(folder, stage - 1, made)
             except checkpoint.CheckpointError as error:
                 raise UserError(
-                    f"{error}; delete {folder} and resume to train it anew"
+                    f"{error}; delete {folder} and resume to train this batch again"
                 ) from error
             for place, name in enumerate(numbers):
                 found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
@@ -229,29 +229,31 @@ def sweep(
 ) -> Path:
     """Trains every configuration with every seed as one population.
 
-    Where several processes have joined by `jax.distributed`, all of them must call
-    this alike, on one file system: each trains batches of its own.
+    If several processes are connected by `jax.distributed`, all of them must call this
+    function with the same arguments, on one file system. Each trains its own batches.
 
     Args:
-      settings: what the members share; `seeds` is of each configuration.
-      out: folder of the sweep, new or empty, or with `resume` an unfinished one.
-      axes: names of traced settings and their values, of which every combination is
-        a configuration; `modes` is K.
-      configurations: these instead, each with values for the same settings.
-      random: so many random configurations instead; the axes' values are ranges.
-      halving: after each task the best 1 / `halving` of the configurations go on, by
-        episodes apart from those that are reported; 1 for all.
-      members_per_batch: trained side by side at most; 0 for as many as fit.
+      settings: settings that all members share; each configuration has `seeds` seeds.
+      out: folder of the sweep, new or empty; with `resume`, an unfinished sweep.
+      axes: names of traced settings and their values; every combination is a
+        configuration. `modes` is K.
+      configurations: used instead of `axes`; values of the same settings in each.
+      random: number of random configurations, used instead of all combinations. An
+        axis is then a range, or one fixed value.
+      halving: after each task, the best 1 / `halving` of the configurations continue,
+        chosen by other episodes than the reported ones; 1 for all.
+      members_per_batch: largest number of members trained at the same time; 0 for as
+        many as fit.
       scenario: your own scenario; if None, the settings name it.
-      resume: go on with what is not finished.
-      log: where scalars go, too, as `train` has it.
-      progress: makes the display.
+      resume: continue an unfinished sweep.
+      log: loggers that also get the scalars, see `train`.
+      progress: class of the display.
 
     Returns:
       The folder; see this module for what it holds, and `write_report`.
 
     Raises:
-      UserError: invalid settings, a folder that does not fit, a full disk.
+      UserError: invalid settings, a folder of another run, or a full disk.
       Stopped: interrupted, and saved.
     """
     folder = Path(out)
@@ -280,8 +282,8 @@ def sweep(
         saved = run_folder.read_header(folder, "sweep")
         require(
             all(saved[name] == header[name] for name in ("members", "halving")),
-            f"{folder} was started with other axes, seeds or halving: give the same "
-            "again or name another --out",
+            f"{folder} was started with other axes, seeds or halving: repeat them or "
+            "use another --out",
         )
         need = memory_estimate.need(plan)
         made = Sweep(
@@ -309,15 +311,14 @@ def _header(
     axes: Mapping[str, Any],
     **asked: int,
 ) -> dict[str, Any]:
-    """What the sweep's settings.json holds.
+    """Returns the contents of the sweep's settings.json.
 
     Args:
-      plan: of any of the members.
-      members: all of them.
-      names: of the settings in which they differ.
-      axes: names of settings and their values, as given; none for those that the
-        members have.
-      asked: what else was asked for.
+      plan: plan of any member.
+      members: all members.
+      names: names of the settings in which members differ.
+      axes: names and values of the axes as given; if empty, the members' values.
+      asked: other arguments of the sweep.
     """
     told = [
         {
@@ -342,6 +343,6 @@ def _header(
 
 
 def _wait(done: Callable[[], bool]) -> None:
-    """Waits for what another process does; its end, too, would end this one."""
+    """Waits for other processes. If one of them ends, JAX ends this one, too."""
     while not done():
         time.sleep(_POLL)
