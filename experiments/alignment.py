@@ -1,9 +1,9 @@
 """Do the adapters converge? Compares forms of the alignment loss and learning rates.
 
 Hidden layers start from the weights of the previous task. Adam trains them only with
-the alignment loss (Eq. 11); random values replace the gradient of the new task. The goal is
-that the order of the adapters no longer changes, and that the weights are the previous
-weights in this order. Then refined wirings (Eq. 12) restore the old policies.
+the alignment loss (Eq. 11); random values replace the gradient of the new task. The
+goal is that the order of the adapters no longer changes, and that the weights are the
+previous weights in this order. Then refined wirings (Eq. 12) restore the old policies.
 """
 
 import statistics

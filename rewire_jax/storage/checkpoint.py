@@ -1,7 +1,7 @@
 """Checkpoints: folders of arrays that are complete or not there.
 
 A checkpoint holds named items, each a pytree of arrays in an Orbax folder of its
-own, so that a policy is read without the replay buffer beside it. `manifest.json`
+own, so that a policy is read without the replay buffer. `manifest.json`
 lists the leaves of each item and the size and SHA-256 of each file. All is written
 under a temporary name and renamed when it is on disk: give checkpoints names of
 their own, in the order of time. A folder of checkpoints has one writer at a time.
@@ -285,7 +285,7 @@ def _foreign(path: Path, content: Any, why: str) -> ForeignError:
     written = known.get("version", "of an unknown version")
     return ForeignError(
         f"checkpoint {path} does not fit rewire_jax {__version__}: {why}; it was "
-        f"written by rewire_jax {written}: use that, or start anew in another folder"
+        f"written by rewire_jax {written}: use that version, or train in another folder"
     )
 
 

@@ -33,7 +33,7 @@ class SweepData(Results):
 
     Attributes:
         random: how many configurations were drawn; 0 for a grid or a list.
-        halving: of this many configurations, one goes on to the next task.
+        halving: one in this many configurations continues with the next task.
         axes: values of the members by name, `[M]` each.
         configurations: number of each member's configuration, `[M]`.
         seeds: `[M]`.

@@ -96,6 +96,6 @@ def _play(
             break
         observation = moment.observation
         if moment.terminal.any():
-            # What ended must be begun anew; nothing there counts any more.
+            # An ended episode must be reset before a step; its rewards no longer count.
             observation = lanes.reset(lanes.task, seeds, moment.terminal)
     return returns, lengths, any_, last
