@@ -87,8 +87,8 @@ class Sweep:
                 _wait(functools.partial(self.finished, stage, len(batches)))
         except (Stopped, KeyboardInterrupt):
             raise Stopped(
-                f"stopped and saved in {self.folder}: to continue, repeat the command "
-                "with --resume"
+                f"stopped and saved in {self.folder}: to continue, give the "
+                "same command with --resume"
             ) from None
 
     def batches(self, stage: int) -> tuple[list[list[int]], int]:

@@ -1,8 +1,8 @@
 """Episodes of simulators on the host: started, stepped, and restored.
 
-Their records are those of compiled environments, `[members, envs]` on the host. The seed
-of an episode and its actions determine the state of a simulator. The actions are in the
-replay buffer. So a resumed run restores a simulator by replaying the actions.
+Their records are those of compiled environments, `[members, envs]` on the host. The
+seed of an episode and its actions determine the state of a simulator. The actions are
+in the replay buffer. So a resumed run restores a simulator by replaying the actions.
 """
 
 # NumPy's arrays stand where the records below have JAX's.

@@ -188,7 +188,7 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
     least = min(settings.interactions // settings.envs, environment.episode_length)
     require(
         shape.transitions >= least or not hosted,
-        f"--buffer {settings.buffer} is too small for an episode, which --resume "
+        f"--buffer {settings.buffer} is too short for an episode, which --resume "
         f"replays from it: give at least {least * settings.envs}",
     )
     make = find_method(settings.method).make
