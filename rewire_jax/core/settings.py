@@ -69,7 +69,7 @@ class SacSettings:
       reward_scale: factor on rewards in the critics' targets.
       target_multiplier: the target entropy is minus this number times the action size.
       initial_temperature: entropy temperature at the start of every task.
-      discount: of future rewards, per step.
+      discount: discount of future rewards, per step.
       target_rate: share by which a target update moves the targets to the critics.
       hidden: neurons in each hidden layer.
       depth: hidden layers of the policy and of each critic.

@@ -74,7 +74,7 @@ class Systems:
 
     Attributes:
       env: the environment of `brax.v1`.
-      config: of the unchanged domain.
+      config: config of the unchanged domain.
       bodies: index of every moving body by its name.
     """
 

@@ -85,11 +85,12 @@ class Scenario:
     """A scenario that can be run.
 
     Attributes:
-      name: of its spec.
+      name: name in its spec.
       domain: name of its domain.
       backend: physics backend, `"probe"` for a probe.
       reward: version of the rewards, where the domain has several.
-      environment: of all tasks; the same object for each domain and backend.
+      environment: environment of all tasks; the same object for each domain and
+        backend.
       tasks: the whole sequence, repeats included.
       distinct: number of distinct tasks.
       interactions: environment steps of training for each task.

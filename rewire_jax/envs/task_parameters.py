@@ -69,7 +69,7 @@ def physical_domain(
       environment: shared by all tasks.
       joints: the joint that each action drives, in action order.
       bodies: names of those that a change may name.
-      physics: of a task, from a valid change.
+      physics: physics of a task, from a valid change.
     """
 
     def make_task(change: TaskChange) -> Task:

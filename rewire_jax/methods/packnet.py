@@ -63,7 +63,7 @@ class State(NamedTuple):
 
     Attributes:
       learned: `[]` number of finished tasks.
-      owners: for every weight and bias the task that keeps it, or `FREE`.
+      owners: for every weight and bias, the task that keeps it, or `FREE`.
       trained: `[]` owner of the weights that updates change: `FREE` until the
         pruning, then the task.
     """

@@ -186,7 +186,7 @@ def fisher_diagonal(
     at least 1e-5 before the mean over states.
 
     Args:
-      layers: of a plain policy.
+      layers: layers of a plain policy.
       states: `[states, observations]`.
 
     Returns:

@@ -49,7 +49,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
 
     Args:
         comparison: the numbers.
-        folder: of the report.
+        folder: folder of the report.
     """
     title, notes = _title(comparison), tuple(_notes(comparison))
     results, costs = run_tables.results(comparison), run_tables.costs(comparison)

@@ -22,7 +22,7 @@ def heading(
     Args:
         subject: what the title begins with.
         settings: settings of the run.
-        tasks: of the sequence that it has.
+        tasks: number of trained tasks.
         seeds: how many, of each run.
         configurations: how many, each with all seeds; of a run 0.
     """

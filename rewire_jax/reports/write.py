@@ -27,7 +27,7 @@ def write_report(
     Runs that know success are measured by their success rates, others by returns.
 
     Args:
-        folders: of the runs, or of the sweep.
+        folders: folders of the runs, or of the sweep.
         out: the folder to write into; made where missing, an old report is replaced.
         single: folders of finished runs that learn one task each, one for every task
             of the sequence: forward transfer of success rates is measured from them.

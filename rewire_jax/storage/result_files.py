@@ -33,7 +33,7 @@ class Results:
     """What the header of a run or a sweep says.
 
     Attributes:
-        folder: of the run or sweep.
+        folder: folder of the run or sweep.
         settings: the resolved settings saved with it.
         tasks: names of the whole sequence, T of them.
         provenance: command, commit, versions, device and start time.

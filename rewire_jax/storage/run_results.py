@@ -127,7 +127,7 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
 
     Args:
         run: as read.
-        name: of the value.
+        name: name of the value.
 
     Raises:
         UserError: the run does not report it, or its file is damaged.

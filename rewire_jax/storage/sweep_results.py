@@ -46,7 +46,7 @@ class SweepData(Results):
         model_size: numbers stored ÷ those of one policy, `[M, T]`, NaN where missing.
         training: interactions spent on training since the beginning, in the same form.
         selection: the same of choosing and rolling back.
-        hours: of all members together, see `Timing`.
+        hours: hours of all members together, see `Timing`.
     """
 
     random: int
