@@ -43,7 +43,7 @@ def run(bench: Bench, single: Sequence[suite.Run] = ()) -> None:
 
     Raises:
       UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
+      rewire_jax.Stopped: interrupted; the same command continues.
     """
     name = bench.name(bench.scenario)
     out = bench.out or Path("runs") / name

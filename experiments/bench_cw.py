@@ -23,7 +23,7 @@ class Bench(bench_brax.Bench):
 
 
 def single(bench: Bench) -> list[suite.Run]:
-    """A run for each task, learned alone; FT-1 is plain SAC there.
+    """Returns a run for each single task; there, FT-1 is plain SAC.
 
     Raises:
       UserError: an unknown scenario, or one whose tasks are none of Continual World's.

@@ -70,7 +70,7 @@ def write(
 
     Raises:
       UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
+      rewire_jax.Stopped: interrupted; the same command continues.
     """
     done = suite.train([run for runs in groups.values() for run in runs], job)
     head, reports, rows = ["method"], [], []

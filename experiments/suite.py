@@ -162,7 +162,7 @@ def train(runs: Sequence[Run], job: Job) -> list[Run]:
     Raises:
       UserError: wrong settings, or another run in a folder, before anything is run; or
         there is nothing to report on.
-      rewire_jax.Stopped: interrupted; the same command goes on.
+      rewire_jax.Stopped: interrupted; the same command continues.
     """
     # What is wrong is found before the first run has gone on for hours.
     for run in runs:
@@ -276,5 +276,5 @@ def command(kind: type[T], run: Callable[[T], Any], name: str) -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except rewire_jax.Stopped:
-        print("stopped and saved; the same command goes on", file=sys.stderr)
+        print("stopped and saved: repeat the command to continue", file=sys.stderr)
         sys.exit(130)

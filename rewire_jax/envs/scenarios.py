@@ -298,7 +298,7 @@ for _name, _tasks in (
     ),
 ):
     register_scenario(_continual_world_spec(_name, _tasks))
-# Each task alone, as the reference for forward transfer.
+# Each single task, as the reference for forward transfer.
 for _change in SCENARIOS["continual_world/cw10"].changes:
     register_scenario(_continual_world_spec(_change.name, _change.name))
 register_scenario(

@@ -206,8 +206,7 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
         return checkpoint.load(path, {"policy": like})[0]["policy"]
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(
-            f"{error}; delete it and what is newer beside it, and --resume trains "
-            "that again"
+            f"{error}; delete it and newer checkpoints, and --resume trains that again"
         ) from error
 
 

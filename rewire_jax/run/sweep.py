@@ -2,7 +2,7 @@
 
 settings.json        what all members share, the axes, the members, provenance
 task-000/            the first task
-  batches.json       which members are trained on it side by side
+  batches.json       which members are trained on it together
   batch-000/         their tables and checkpoints, as a run's (see `run_folder`)
 
 All members are trained on a task, in batches that fit the memory, before the next task

@@ -48,7 +48,7 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
     """Writes a checkpoint; it is complete or not there.
 
     Args:
-      path: the folder to make; one that stands there gives way at the last moment.
+      path: the folder to create; it replaces an existing folder at the last moment.
       items: pytrees of arrays, by the name under which `load` finds them.
       metadata: what JSON can hold.
 
@@ -232,7 +232,7 @@ def _check_sizes(found: Any, like: Any) -> None:
 
 @contextmanager
 def _orbax() -> Iterator[tuple[Any, Any]]:
-    """Orbax, and a synchronous checkpointer that reports by exceptions alone."""
+    """Orbax, and a synchronous checkpointer that reports only by exceptions."""
     # Here, because it takes long to import.
     import orbax.checkpoint as ocp
     from orbax.checkpoint._src.multihost import multihost

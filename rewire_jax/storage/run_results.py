@@ -76,7 +76,7 @@ class RunData(Results):
 
 
 def read_run(folder: str | Path, success: Success = "any") -> RunData:
-    """Reads a run from its folder alone.
+    """Reads a run, only from its folder.
 
     The last line of a table may have been cut by a crash and is then ignored. A row
     written again by a resumed run replaces the earlier one.

@@ -89,7 +89,7 @@ class SweepData(Results):
 
 
 def read_sweep(folder: str | Path) -> SweepData:
-    """Reads a sweep from its folder alone.
+    """Reads a sweep, only from its folder.
 
     As in a run's tables, a last line that was cut is ignored, and a row written again
     replaces the earlier one.
@@ -159,7 +159,7 @@ def _design(head: Results) -> dict[str, Any]:
 
 
 def batches_of(folder: Path, stage: int) -> Path:
-    """The file that says which members are trained on a task side by side."""
+    """The file that says which members are trained together on a task."""
     return folder / f"task-{stage:03d}" / "batches.json"
 
 

@@ -5,7 +5,7 @@ seed of an episode and its actions determine the state of a simulator. The actio
 in the replay buffer. So a resumed run restores a simulator by replaying the actions.
 """
 
-# NumPy's arrays stand where the records below have JAX's.
+# The records below have JAX arrays as types; here they contain NumPy arrays.
 # mypy: disable-error-code="arg-type"
 
 from typing import Any

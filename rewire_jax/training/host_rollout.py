@@ -1,6 +1,6 @@
 """Whole episodes in environments that are stepped on the host."""
 
-# NumPy's arrays stand where the records below have JAX's.
+# The records below have JAX arrays as types; here they contain NumPy arrays.
 # mypy: disable-error-code="arg-type"
 
 import functools

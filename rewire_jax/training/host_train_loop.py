@@ -3,7 +3,7 @@
 It makes the same steps, updates and random draws as `train_loop.run_chunk`.
 """
 
-# NumPy's arrays stand where the records below have JAX's.
+# The records below have JAX arrays as types; here they contain NumPy arrays.
 # mypy: disable-error-code="arg-type"
 
 import functools

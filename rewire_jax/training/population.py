@@ -40,7 +40,7 @@ class Members(NamedTuple):
     """The values that differ between members; every leaf is `[members]`.
 
     Attributes:
-      keys: random keys, made from the seed alone.
+      keys: random keys, made only from the seeds.
       sac: SAC's settings.
       options: the method's settings.
     """
