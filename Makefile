@@ -3,24 +3,25 @@
 VENV := .venv
 PINS := constraints.txt
 EXTRAS := dev
-# What ends in -mjx has an environment of its own: MTCWorldMJX needs another MuJoCo than
-# metaworld does.
+# Targets that end in -mjx have their own virtual environment: MTCWorldMJX and metaworld
+# need different versions of MuJoCo.
 %-mjx %-mjx/.installed: VENV := .venv-mjx
 %-mjx %-mjx/.installed: PINS := constraints-mjx.txt
 %-mjx %-mjx/.installed: EXTRAS := cw-mjx,test
-# What ends in -bench has one with other implementations, to measure beside ours.
+# Targets that end in -bench have their own virtual environment with other
+# implementations, to compare speeds.
 %-bench %-bench/.installed: VENV := .venv-bench
 %-bench %-bench/.installed: PINS := constraints-bench.txt
 %-bench %-bench/.installed: EXTRAS := bench,test
 
-# Deferred: Python is looked for only where it is used.
+# Deferred: Python is searched for only when a target needs it.
 PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
 RUN = $(VENV)/bin/python
 # A file's tests share what they train, so they stay in one process.
 WORKERS ?= -n 2 --dist loadfile
 
 comma := ,
-# $(call option,NAME,VALUE): `--NAME VALUE` where VALUE is set, else nothing.
+# $(call option,NAME,VALUE): `--NAME VALUE` if VALUE is set, else nothing.
 option = $(if $(strip $(2)),--$(1) $(2))
 
 .DEFAULT_GOAL := help
@@ -29,25 +30,25 @@ option = $(if $(strip $(2)),--$(1) $(2))
 	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
 	notebooks docs clean
 
-help: ## Say what there is
+help: ## List the commands
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-13s %s\n", $$1, $$2 }' Makefile
-	@echo 'bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED INTERACTIONS TASKS' \
-		'BACKEND OUT KEEP where set, bench-cw REWARD and TRANSFER too, bench-speed PARTS.'
+	@echo 'Variables: bench-brax and bench-cw read SCENARIO METHODS PROFILE SEEDS SEED' \
+		'INTERACTIONS TASKS BACKEND OUT KEEP; bench-cw also REWARD TRANSFER; bench-speed PARTS.'
 
-setup: .venv/.installed ## Make .venv with the pinned versions (does nothing when up to date)
+setup: .venv/.installed ## Create .venv with the pinned versions (does nothing if up to date)
 
-setup-mjx: .venv-mjx/.installed ## Make .venv-mjx: Meta-World on MJX-Warp instead of C MuJoCo
+setup-mjx: .venv-mjx/.installed ## Create .venv-mjx, for Meta-World on MJX-Warp instead of C MuJoCo
 
-setup-bench: .venv-bench/.installed ## Make .venv-bench: with what bench-speed compares to
+setup-bench: .venv-bench/.installed ## Create .venv-bench, with the implementations that bench-speed compares
 
-# An environment that can run pip is kept, anything else is made anew.
+# A virtual environment that can run pip is kept. Otherwise it is created again.
 define make_venv
 @$(RUN) -m pip --version >/dev/null 2>&1 || { \
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 		echo 'error: "$(PYTHON)" is not Python 3.11 or newer;' \
 			'name one: make setup PYTHON=/path/to/python3.11' >&2; \
 		exit 1; }; \
-	echo 'Making $(VENV)'; \
+	echo 'Creating $(VENV)'; \
 	"$(PYTHON)" -m venv --clear $(VENV); }
 endef
 
@@ -60,8 +61,8 @@ endef
 		-c $(PINS) -e '.[$(EXTRAS)]'
 	@touch $@
 
-# Pins that are there stay; `make lock UPGRADE=1` looks for newer versions.
-lock: ## Resolve the dependencies anew into constraints.txt (UPGRADE=1: newest)
+# Keeps existing pins; `make lock UPGRADE=1` looks for newer versions.
+lock: ## Resolve the dependencies into constraints.txt; keep existing pins (not with UPGRADE=1)
 lock-mjx: ## The same into constraints-mjx.txt
 lock-bench: ## The same into constraints-bench.txt
 lock lock-mjx lock-bench:
@@ -79,31 +80,31 @@ print(f"# The versions that are tested together. Made by `make {sys.argv[1]}`: d
 packages = [item["metadata"] for item in json.load(sys.stdin)["install"]]
 for package in sorted(packages, key=lambda package: package["name"].lower()):
     if package["name"] != "rewire_jax":
-        # A build's own suffix, as of PyTorch for a CPU, is not found everywhere.
+        # Not every index has builds with a suffix, such as PyTorch's for CPUs.
         print(package["name"] + "==" + package["version"].split("+")[0])
 endef
 export LOCK
 
-lint: setup ## Check style, format, types and which room imports which
+lint: setup ## Check style, format, types and imports between layers
 	$(VENV)/bin/lint-imports
 	$(RUN) -m ruff check
 	$(RUN) -m ruff format --check
 	$(RUN) -m mypy rewire_jax experiments docs notebooks
 
-format: setup ## Mend what ruff can mend
+format: setup ## Fix what ruff can fix
 	$(RUN) -m ruff check --fix
 	$(RUN) -m ruff format
 
-test: lint ## Set up, lint, run all tests but the slow ones
+test: lint ## Set up, lint, run all tests except the slow ones
 	$(RUN) -m pytest -m 'not slow' $(WORKERS)
 
 test-slow: setup ## Run the slow tests
 	$(RUN) -m pytest -m slow $(WORKERS)
 
-test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (compiles for minutes at first)
+test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (the first run compiles for minutes)
 	$(RUN) -m pytest tests/envs/test_metaworld_mjx.py
 
-test-bench: setup-bench ## Run the tests of what bench-speed compares to
+test-bench: setup-bench ## Run the tests of the implementations that bench-speed compares
 	$(RUN) -m pytest tests/experiments/test_bench_peers.py
 
 bench_options = $(strip \
@@ -118,29 +119,28 @@ bench_options = $(strip \
 	$(call option,out,$(OUT)) \
 	$(if $(KEEP),--keep))
 
-bench-brax: setup ## Run the methods on a Brax scenario, make its table and figures
+bench-brax: setup ## Run the methods on a Brax scenario, write tables and plots
 	$(RUN) -m experiments.bench_brax $(bench_options)
 
-bench-cw: setup ## The same on a Continual World scenario (TRANSFER=1: and each task alone)
+bench-cw: setup ## The same on a Continual World scenario (TRANSFER=1: also on each single task)
 	$(RUN) -m experiments.bench_cw $(strip $(bench_options) \
 		$(call option,reward,$(REWARD)) \
 		$(if $(TRANSFER),--transfer))
 
-bench-speed: setup ## Measure what is fast and slow, and peers after setup-bench
+bench-speed: setup ## Measure speeds; after setup-bench also of other implementations
 	$(if $(wildcard .venv-bench/.installed),.venv-bench/bin/python,$(RUN)) \
 		-m experiments.bench_speed $(call option,parts,$(subst $(comma), ,$(PARTS)))
 
-bench-mjx: setup-mjx ## Measure steps a second of Meta-World on MJX-Warp
+bench-mjx: setup-mjx ## Measure steps per second of Meta-World on MJX-Warp
 	$(RUN) -m experiments.bench_mjx
 
-readme: setup ## Make the tables of README.md and docs anew from experiments/results
+readme: setup ## Copy tables from experiments/results into README.md and docs
 	$(RUN) -m experiments.readme
 
-
-notebooks: setup ## Execute the notebooks anew, in place
+notebooks: setup ## Execute the notebooks in place
 	$(RUN) -m notebooks.execute
 
-docs: setup ## Build the documentation into site/, warnings being errors
+docs: setup ## Build the documentation into site/; a warning is an error
 	$(RUN) -m sphinx --fail-on-warning --keep-going --quiet --fresh-env \
 		--doctree-dir build/doctrees docs site
 	@echo 'open site/index.html'

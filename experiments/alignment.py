@@ -1,9 +1,9 @@
-"""Does the alignment loss settle? Its form and the adapters' learning rate compared.
+"""Do the adapters converge? Compares forms of the alignment loss and learning rates.
 
-Hidden layers start where the last task left them and are pulled to it by the alignment
-loss (Eq. 11) alone, under Adam, with random numbers for the new task's gradient. What
-is hoped for: adapters whose order stays, and weights that are the previous ones in
-that order, so that refined wirings (Eq. 12) give the old policies back.
+Hidden layers start from the weights of the previous task. Adam trains them only with
+the alignment loss (Eq. 11); random values replace the gradient of the new task. The
+goal is that the order of the adapters no longer changes, and that the weights are the
+previous weights in this order. Then refined wirings (Eq. 12) restore the old policies.
 """
 
 import statistics
@@ -39,12 +39,12 @@ class Alignment:
     Attributes:
       observations: inputs of the first layer.
       width: neurons in each of three hidden layers.
-      updates: policy updates after which to look.
+      updates: numbers of policy updates after which results are recorded.
       rate: Adam's learning rate.
       beta: weight of the alignment loss.
       tau: temperature of the adapters' relaxation.
       noise: standard deviation of the new task's gradient.
-      seeds: how many.
+      seeds: number of seeds.
       out: the result files, without a suffix.
     """
 

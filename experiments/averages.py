@@ -1,4 +1,4 @@
-"""Performances averaged over scenarios, as the paper's tables have them."""
+"""Performances averaged over scenarios, as in the paper's tables."""
 
 import statistics
 from collections.abc import Sequence

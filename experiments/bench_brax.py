@@ -1,7 +1,7 @@
-"""The main job: methods on one Brax scenario, with a table and pictures at the end.
+"""The main benchmark: methods on one Brax scenario, with a table and plots at the end.
 
-Run by `make bench-brax`. A method whose run is finished is not run again, and one
-that was stopped goes on, so the same command can be given until all is done.
+Run by `make bench-brax`. It skips methods whose run is finished and continues stopped
+runs, so you can repeat the command until everything is finished.
 """
 
 import sys
@@ -22,9 +22,9 @@ class Bench(suite.Job):
 
     Attributes:
       scenario: name of the scenario.
-      methods: names of the methods, run one after the other; "all" for every one.
-      out: folder for runs and report; named after scenario and profile if not given.
-      keep: also put the report under experiments/results, to be committed.
+      methods: names of the methods, run one after the other; "all" for all methods.
+      out: folder for runs and report; by default named after scenario and profile.
+      keep: also write the report to experiments/results, to be committed.
     """
 
     scenario: str = "halfcheetah/forgetting"
@@ -43,7 +43,7 @@ def run(bench: Bench, single: Sequence[suite.Run] = ()) -> None:
 
     Raises:
       UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
+      rewire_jax.Stopped: interrupted; the same command continues.
     """
     name = bench.name(bench.scenario)
     out = bench.out or Path("runs") / name

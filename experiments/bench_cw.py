@@ -1,4 +1,4 @@
-"""The main job on Continual World: as `bench_brax`, with forward transfer if asked for.
+"""The main benchmark on Continual World: like `bench_brax`; optional forward transfer.
 
 Run by `make bench-cw`.
 """
@@ -15,7 +15,7 @@ class Bench(bench_brax.Bench):
 
     Attributes:
       scenario: name of the scenario.
-      transfer: also learn each task alone, to measure forward transfer.
+      transfer: also train on each single task, to measure forward transfer.
     """
 
     scenario: str = "continual_world/t3"
@@ -23,7 +23,7 @@ class Bench(bench_brax.Bench):
 
 
 def single(bench: Bench) -> list[suite.Run]:
-    """A run for each task, learned alone; FT-1 is plain SAC there.
+    """Returns a run for each single task; there, FT-1 is plain SAC.
 
     Raises:
       UserError: an unknown scenario, or one whose tasks are none of Continual World's.

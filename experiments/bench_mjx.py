@@ -1,4 +1,4 @@
-"""Environment steps a second of Meta-World on MJX-Warp, by number of environments.
+"""Steps per second of Meta-World on MJX-Warp, by number of environments.
 
 Run by `make bench-mjx`. Rates are those of the best round; actions are random.
 """
@@ -30,7 +30,7 @@ class BenchMjx:
     Attributes:
       tasks: names of the tasks, together in one domain.
       environments: numbers of parallel environments.
-      steps: of every environment, in one compiled loop.
+      steps: steps of each environment, in one compiled loop.
       rounds: how often each loop is timed.
       out: the result files, without a suffix; named after the device if not given.
     """

@@ -1,7 +1,7 @@
-"""What this machine does: updates, environments, whole loops, and peers beside them.
+"""Speeds on this machine: updates, environments, whole loops, other implementations.
 
-Run by `make bench-speed`. No figure is a claim about other machines. What is compared
-is timed in turn, round after round; see `experiments.speed.timing`.
+Run by `make bench-speed`. The results say nothing about other machines. Compared
+programs are timed in turn, in several rounds; see `experiments.speed.timing`.
 """
 
 import json
@@ -47,11 +47,11 @@ class Bench:
     """How to measure.
 
     Attributes:
-      parts: which; all if none is named. The others' results are kept.
+      parts: parts to measure; all if none is named. Results of other parts are kept.
       out: folder of the results; named after the device if not given.
       rounds: how often each loop is timed.
-      seconds: about how long each time.
-      quick: tiny networks and short loops, to see that it runs.
+      seconds: approximate duration of each measurement.
+      quick: tiny networks and short loops, to check that the program runs.
     """
 
     parts: tuple[str, ...] = ()

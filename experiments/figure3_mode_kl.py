@@ -1,8 +1,8 @@
-"""The paper's Figure 3: how far the modes' policies are apart during the first task.
+"""The paper's Figure 3: divergence between the modes' policies during the first task.
 
-The paper sees them diverge and then converge, sooner with distillation. What is shown
-is the KL divergence over all pairs of modes and over states from the buffer, without
-the noise that exploration and distillation add.
+In the paper the modes diverge and then converge, earlier with distillation. The plot
+shows the KL divergence, averaged over all pairs of modes and over states from the
+buffer, without the noise on the scores.
 """
 
 from typing import NamedTuple
@@ -21,10 +21,10 @@ QUANTITY = "KL divergence between modes"
 
 
 class Pattern(NamedTuple):
-    """What becomes of a curve, told by its medians over a tenth of the reports.
+    """The course of a curve: medians over a tenth of the reports.
 
-    Not by means: a state for which one mode is nearly sure of its action can make the
-    divergence in a report a thousand times that in its neighbours.
+    Means do not work here: one state in which a mode is nearly deterministic can make
+    the divergence in a report a thousand times larger than in the next report.
 
     Attributes:
       at: interactions around which it is highest.

@@ -1,7 +1,8 @@
 """The paper's Figure 4: performance and model size on the HalfCheetah scenarios.
 
-Beside all methods stand CSP-S, whose policies are narrower, and Ours-L, whose policy is
-wider. Widths are the paper's 175 and 384 of 256, scaled to the profile's networks.
+It also has CSP-S, with narrower policies, and Ours-L, with a wider policy. In the
+paper their widths are 175 and 384 instead of 256; here they are scaled to the profile's
+networks.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
-"""The paper's Figure 5: training on the first task with and without the designs.
+"""The paper's Figure 5: training on the first task, with parts of the method left out.
 
-Figure 3 is made from two of the same runs. What the paper read off its curves is read
-off these: how soon a return of 2,000 is reached, and what is earned in the end.
+Figure 3 uses two of the same runs. As in the paper, the table shows when a return of
+2,000 is reached, and the return at the end.
 """
 
 import itertools

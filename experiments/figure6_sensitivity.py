@@ -1,8 +1,8 @@
-"""The paper's Figure 6: performance over K, α and β, a panel for each.
+"""The paper's Figure 6: performance over K, α and β, in one panel each.
 
-The paper varies each of the three with the others at their best, which takes a grid
-(`--full`). The lines through the profile's own values alone are a sixth of it. Either
-is one sweep, and one population as far as memory goes.
+The paper varies each of the three settings while the others have their best values.
+This requires all combinations (`--full`). Without `--full`, the other settings have the
+profile's values, which requires a sixth of the members. Both are one sweep.
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ class Figure6(suite.Experiment):
       modes: values of K.
       alpha: weights of the distillation between modes.
       beta: weights of the alignment loss.
-      full: every combination; otherwise each with the others at the profile's values.
-      members_per_batch: trained side by side at most; 0 for as many as fit.
+      full: train all combinations; otherwise vary one setting at a time.
+      members_per_batch: most members trained at the same time; 0 for as many as fit.
     """
 
     scenario: str = "halfcheetah/forgetting"

@@ -1,8 +1,7 @@
-"""What the pictures of training share: curves of runs on their first task.
+"""Shared code of the plots of training: learning curves on the first task.
 
-Every seed is a run of its own. So results come seed by seed, and several commands can
-train some of the seeds each (`--seed`, `--seeds`, `--variants`) and leave the picture
-to the last one.
+Each seed is a separate run. So several commands can train different seeds or variants
+in parallel (`--seed`, `--seeds`, `--variants`), and a last command plots them all.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,8 +35,8 @@ class FirstTask(suite.Experiment):
 
     Attributes:
       scenario: name of the scenario.
-      tasks: of the sequence that are trained; only the first is shown.
-      variants: which of the runs to train and show, by their names; all if empty.
+      tasks: number of tasks to train; only the first task is shown.
+      variants: names of the variants to train and show; all if empty.
     """
 
     scenario: str = "halfcheetah/forgetting"
@@ -79,13 +78,13 @@ class FirstTask(suite.Experiment):
 
 
 class Trained(NamedTuple):
-    """What the runs of a variant give.
+    """Results of the runs of a variant.
 
     Attributes:
-      curve: of what was reported in training, `[seeds, points]`.
-      seeds: theirs.
-      returns: `[seeds]`, of the policy after the task, without exploration.
-      episode: interactions in which all environments play an episode.
+      curve: `[seeds, points]`, the values reported in training.
+      seeds: the seeds.
+      returns: `[seeds]`, returns after the task, without exploration.
+      episode: interactions that all environments need for one episode.
     """
 
     curve: Curve
@@ -113,7 +112,7 @@ class Trained(NamedTuple):
 
 
 class Evolution(NamedTuple):
-    """What the progress reports of runs tell.
+    """Learning curves from the progress reports of runs.
 
     Attributes:
       title: what was run, and with what budget.

@@ -1,8 +1,8 @@
-"""What the loop around Continual World's simulators costs beyond its parts.
+"""The time of the loop around Continual World's simulators, compared with its parts.
 
-Simulators alone, updates alone, and the loop of both, without and with overlap, take
-turns; each is timed over the same number of steps. Ratios are those of one round's
-times, so that what slows the machine for longer does not count, and medians of rounds.
+It times only the simulators, only the updates, and the loop of both, without and with
+overlap. All take the same number of steps and are timed in turn. A ratio is the median
+over rounds of the ratio within a round, so slow phases of the machine do not change it.
 """
 
 import dataclasses
@@ -40,14 +40,14 @@ class HostLoop:
     """What to measure.
 
     Attributes:
-      scenario: of the domain "metaworld"; its first task is played.
+      scenario: a scenario of the domain "metaworld"; only its first task is used.
       methods: names of the methods.
-      seeds: members.
-      widths: of the layers; 0 for the paper's. With narrow ones simulators and
-        updates take times more alike, and overlap has more to gain.
-      times: of 50 steps and 50 updates, in one measurement; 40 are those between two
-        progress reports of the quick profile.
-      rounds: measurements of each kind.
+      seeds: number of members.
+      widths: neurons in each layer; 0 for the paper's. With narrow layers, simulators
+        and updates take similar times, and overlap gains more.
+      times: how often 50 steps and 50 updates are made in a measurement; 40 is the
+        number between two progress reports of the quick profile.
+      rounds: number of measurements of each kind.
       out: result files, without a suffix.
     """
 
@@ -61,7 +61,7 @@ class HostLoop:
 
 
 class Loop:
-    """One task's loop, somewhere in the middle of it."""
+    """The loop of a task, in the middle of the task."""
 
     def __init__(self, plan: Plan):
         """Begins the first task and makes its first updates."""

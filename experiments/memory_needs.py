@@ -1,4 +1,4 @@
-"""What a member needs of a device's memory, by method and number of environments.
+"""The device memory of a member, by method and number of environments.
 
 Nothing is trained or compiled: `rewire_jax.training.memory_estimate` counts it from
 shapes and traces.
@@ -41,7 +41,7 @@ class MemoryNeeds:
     """What to count.
 
     Attributes:
-      envs: numbers of environments for which the first method is counted, too.
+      envs: further numbers of environments, for the first method only.
       out: the result files, without a suffix.
     """
 

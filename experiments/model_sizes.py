@@ -1,7 +1,7 @@
-"""Each method's model size on the Brax scenarios, beside the paper's Table 1.
+"""Each method's model size on the Brax scenarios, next to the paper's Table 1.
 
-Nothing is trained: every method is led through the scenarios' sequences with the paper
-profile's settings, and counts what it stores, as it does in a run.
+Nothing is trained. Each method starts and ends all tasks of each scenario with the
+settings of the paper profile. Then it counts what it stores, as in a run.
 """
 
 import statistics

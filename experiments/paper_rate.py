@@ -1,7 +1,7 @@
-"""Runs the paper profile briefly on each domain, and says what all of it would take.
+"""Runs the paper profile briefly on each domain, and estimates the time of whole runs.
 
-Interactions per second are taken once updates are under way and nothing compiles any
-more. Evaluation and selection come on top of the hours given.
+Interactions per second are measured after the first updates and after all compilation.
+The estimated hours do not include evaluation and selection.
 """
 
 import json
@@ -28,7 +28,7 @@ class PaperRate:
 
     Attributes:
       method: name of the method.
-      interactions: of the first task of each scenario.
+      interactions: interactions to train on the first task of each scenario.
       out: the result files, without a suffix.
     """
 

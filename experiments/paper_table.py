@@ -1,7 +1,7 @@
-"""What the paper's Tables 1 and 2 share: methods side by side, averaged over scenarios.
+"""Shared code of the paper's Tables 1 and 2: methods, averaged over scenarios.
 
-All runs are made one after the other, each is resumed where it was stopped. The table
-is made from their files alone; with `--no-train` from those that there are.
+All runs are trained one after the other; a stopped run is continued. The table is made
+only from the files of the runs; with `--no-train`, from those that exist.
 """
 
 from collections.abc import Mapping, Sequence
@@ -70,7 +70,7 @@ def write(
 
     Raises:
       UserError: wrong arguments.
-      rewire_jax.Stopped: interrupted; the same command goes on.
+      rewire_jax.Stopped: interrupted; the same command continues.
     """
     done = suite.train([run for runs in groups.values() for run in runs], job)
     head, reports, rows = ["method"], [], []

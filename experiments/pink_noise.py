@@ -1,7 +1,7 @@
-"""The paper's comparison of its modes with pink noise, both ways to explore better.
+"""The paper's comparison of exploration by modes with exploration by pink noise.
 
-Pink noise (Eberhard et al., ICLR 2023) is correlated in time: an action's noise pushes
-to one side for longer.
+Pink noise (Eberhard et al., ICLR 2023) is correlated in time, so the noise of an action
+keeps its sign for longer.
 """
 
 from experiments import first_task, suite

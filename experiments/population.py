@@ -1,8 +1,7 @@
 """Populations of several sizes: compile time, memory, and time per member.
 
-Each size is measured in a process of its own, so that no other's memory is in its
-peak. Interactions are taken with all their updates, round after round, and the best
-round counts.
+Each size is measured in a separate process, so that its peak memory includes no other
+size. Interactions are timed together with their updates, and the best round counts.
 """
 
 import json
@@ -57,13 +56,13 @@ class Population:
 
     Attributes:
       members: sizes of the populations, the smallest first.
-      scenario: on which.
-      method: by which.
-      profile: whose sizes.
-      rounds: how often each is timed.
-      steps: of all environments in a round.
+      scenario: name of the scenario.
+      method: name of the method.
+      profile: profile of the settings.
+      rounds: how often each size is timed.
+      steps: vector steps in a round.
       out: the result files, without a suffix; named after the device if not given.
-      measure: measures a single size in this process, and prints it as JSON.
+      measure: measure only this size, in this process, and print the result as JSON.
     """
 
     members: tuple[int, ...] = (1, 8, 32)

@@ -1,8 +1,8 @@
-"""Records episodes of metaworld's scripted experts, to test the compiled tasks by.
+"""Records episodes of metaworld's scripted experts, to test the compiled tasks.
 
-An episode is kept to a few steps after its success, with all that C MuJoCo's state was
-at each of them, so that single steps can be compared too. Run it where metaworld is
-installed: `python -m experiments.record_experts`.
+An episode is recorded until a few steps after its success. Each step has the complete
+state of C MuJoCo, so that tests can compare single steps, too. Run it in a virtual
+environment with metaworld: `python -m experiments.record_experts`.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class RecordExperts:
 
     Attributes:
       tasks: names of the tasks.
-      out: folder; `<task>.npz` are written into it.
+      out: folder for the files `<task>.npz`.
     """
 
     tasks: tuple[str, ...]

@@ -1,7 +1,7 @@
-"""What the experiments share: runs, one after the other, and files of results.
+"""Shared code of the experiments: runs, one after the other, and files of results.
 
-A run that is finished is not run again, and one that was stopped goes on, so the same
-command can be given until all is done. Experiments find each other's runs.
+A finished run is not repeated, and a stopped run is continued. So you can repeat a
+command until everything is finished. Experiments use each other's runs.
 """
 
 import sys
@@ -50,13 +50,13 @@ class Job:
 
     Attributes:
       profile: "quick" or "paper".
-      seeds: members of each run.
-      seed: of the first member.
-      interactions: of training for each task; 0 takes the profile's.
-      tasks: of the sequence that are trained; 0 takes the profile's number.
-      backend: physics backend; the domain's first if None.
-      reward: version of Meta-World's rewards; elsewhere it changes nothing.
-      train: otherwise report on the runs that there are, as far as they have come.
+      seeds: number of members of each run.
+      seed: seed of the first member.
+      interactions: training interactions for each task; 0 for the profile's value.
+      tasks: number of tasks to train; 0 for the profile's value.
+      backend: physics backend; by default the first backend of the domain.
+      reward: version of Meta-World's rewards; ignored in other domains.
+      train: train; if not, only report on existing runs, finished or not.
     """
 
     profile: str = "quick"
@@ -106,7 +106,7 @@ class Experiment(Job):
 
     Attributes:
       out: folder of all runs, with a folder for each scenario, and of the results.
-      keep: put the result under experiments/results instead, to be committed.
+      keep: write the result to experiments/results instead, to be committed.
     """
 
     out: Path = Path("runs")
@@ -127,7 +127,7 @@ class Experiment(Job):
 
 
 class Run(NamedTuple):
-    """One of an experiment's runs: its folder, what is learned and how."""
+    """A run of an experiment: its folder, scenario and settings."""
 
     folder: Path
     scenario: rewire_jax.Scenario
@@ -162,7 +162,7 @@ def train(runs: Sequence[Run], job: Job) -> list[Run]:
     Raises:
       UserError: wrong settings, or another run in a folder, before anything is run; or
         there is nothing to report on.
-      rewire_jax.Stopped: interrupted; the same command goes on.
+      rewire_jax.Stopped: interrupted; the same command continues.
     """
     # What is wrong is found before the first run has gone on for hours.
     for run in runs:
@@ -276,5 +276,5 @@ def command(kind: type[T], run: Callable[[T], Any], name: str) -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     except rewire_jax.Stopped:
-        print("stopped and saved; the same command goes on", file=sys.stderr)
+        print("stopped and saved: repeat the command to continue", file=sys.stderr)
         sys.exit(130)

@@ -13,8 +13,8 @@ class Table1(paper_table.Table):
 
     Attributes:
       scenarios: names of the scenarios.
-      methods: names of the methods, or "all"; SAC-N, which normalises, is among them
-        in any case.
+      methods: names of the methods, or "all". SAC-N is always included, because scores
+        are divided by its performance.
     """
 
     scenarios: tuple[str, ...] = SCENARIOS

@@ -1,7 +1,7 @@
 """The paper's Table 2: success rates of all methods on Continual World.
 
-CW3 is the average over eight sequences of three tasks, CW10 is one of ten. Both are
-sequences on Meta-World v3, the paper's are on v1.
+CW3 is the average over eight sequences of three tasks. CW10 is one sequence of ten.
+Both use Meta-World v3; the paper used v1.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,8 @@ class Table2(paper_table.Table):
     Attributes:
       scenarios: names of the scenarios.
       methods: names of the methods, or "all".
-      success: steps of an episode that count as solved, any or the last alone.
+      success: count an episode as solved if it is solved at any step, or only if it is
+        solved at the last step.
     """
 
     scenarios: tuple[str, ...] = SCENARIOS

@@ -1,8 +1,8 @@
-"""The paper's Table 3: what each of rewiring's designs adds to FT-L2.
+"""The paper's Table 3: the effect of each part of rewiring, added to FT-L2.
 
-The rows without alignment hold the weights near the previous ones as FT-L2 does, with
-its published coefficient: the paper starts from FT-L2 and adds the designs. SAC-N runs
-besides, to normalise.
+The paper starts from FT-L2 and adds the parts. So the rows without alignment hold the
+weights near the previous weights, as FT-L2 does, with its published coefficient. SAC-N
+is also trained, because scores are divided by its performance.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""From the words of a command line to a command."""
+"""Parses a command line into a command."""
 
 import contextlib
 import io
@@ -31,14 +31,14 @@ _AXES = {
 
 @dataclass(frozen=True, kw_only=True)
 class First(Flags):
-    """What must be known before all else: settings' defaults depend on it.
+    """Arguments that are read first, because other defaults depend on them.
 
     Attributes:
       words: the command and its positional arguments.
-      method: of the settings.
-      profile: of the settings.
-      backend: of the settings.
-      reward: of the settings.
+      method: see `Settings`.
+      profile: see `Settings`.
+      backend: see `Settings`.
+      reward: see `Settings`.
     """
 
     words: tyro.conf.Positional[tuple[str, ...]] = ()
@@ -63,7 +63,7 @@ class Overview(Flags):
 
 
 def first(words: Sequence[str]) -> First:
-    """Reads what must be known first, and skips the rest.
+    """Reads the arguments of `First` and skips the others.
 
     Raises:
       UserError: one of these flags has no value, or a wrong one.
@@ -76,8 +76,8 @@ def command(words: Sequence[str], known: First) -> Callable[[], None]:
     """Reads a command and its arguments.
 
     Args:
-      words: all of them.
-      known: what `first` read from them.
+      words: all words of the command line.
+      known: result of `first` for these words.
 
     Raises:
       UserError: the command or an argument is missing, unknown or wrong.
@@ -105,7 +105,7 @@ def command(words: Sequence[str], known: First) -> Callable[[], None]:
 
 
 def _parse(kind: type[T], prog: str, words: Sequence[str], **options: Any) -> Any:
-    """Parses with tyro, but tells what is wrong in one line.
+    """Parses with tyro, but reports an error in one line.
 
     Raises:
       UserError: an argument is missing, unknown or wrong.
@@ -118,8 +118,8 @@ def _parse(kind: type[T], prog: str, words: Sequence[str], **options: Any) -> An
     except SystemExit as exit_:
         if not exit_.code:
             raise
-    # tyro has no public way to tell what is wrong but to print it: in a box, in parts
-    # with rules between them, with help texts indented.
+    # tyro only prints errors: in a box, in parts between horizontal lines, with help
+    # texts indented.
     lines = Text.from_ansi(box.getvalue()).plain.splitlines()[1:-1]
     lines = [line[2:].rstrip("│ ") for line in lines if line[2:10].strip("│ ")]
     parts = re.split(r"(?m)^[─-]+$", "\n".join(lines))

@@ -1,4 +1,4 @@
-"""The commands of `rewire-jax`: their arguments, and what each of them does.
+"""The commands of `rewire-jax`: a class for each, with its arguments as fields.
 
 The docstrings are the help texts.
 """
@@ -29,13 +29,13 @@ Axes = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Flags:
-    """What every command can be given.
+    """Flags of every command.
 
     Attributes:
-      cache: folder for compiled programs, ~/.cache/rewire_jax by default; "off" keeps
-        none.
-      debug: show the traceback of an error.
-      version: show the version.
+      cache: folder for compiled programs; "off" keeps none. By default the folder in
+        JAX_COMPILATION_CACHE_DIR if it is set, else ~/.cache/rewire_jax.
+      debug: print the traceback of an error.
+      version: print the version and exit.
     """
 
     cache: str | None = None
@@ -49,7 +49,7 @@ class Train(Flags):
 
     Attributes:
       scenario: name of the task sequence.
-      settings: of the run.
+      settings: settings of the run.
       out: folder for the run, new or empty.
       resume: continue the run in this folder from its newest checkpoint.
       log: also log scalars to tensorboard, wandb, or both.
@@ -62,7 +62,7 @@ class Train(Flags):
     log: tuple[str, ...] = ()
 
     def __call__(self, scenario: Scenario) -> None:
-        """Trains, on a scenario that is made already."""
+        """Trains on a scenario object, then prints the folder of the run."""
         folder = train_run.train(
             self.settings,
             self.out,
@@ -77,20 +77,24 @@ class Train(Flags):
 class Sweep(Flags):
     """Trains every combination of settings with every seed as one population.
 
-    A setting with several values is an axis: `--k 1 2 3`, `--alpha 0 1e-6 1e-5`,
-    `--beta 0.1 1 10`, and for any other number `--axis NAME VALUE...`, for example
-    `--axis tau 0.1 1`. All members finish a task before the next task starts.
+    A configuration is one combination. A member is one configuration with one seed. A
+    setting with several values is an axis: `--k 1 2 3`, `--alpha 0 1e-6 1e-5`,
+    `--beta 0.1 1 10`, and `--axis NAME VALUE...` for other numeric settings of SAC and
+    of the method, for example `--axis tau 0.1 1`. All members finish a task before the
+    next task starts.
 
     Attributes:
       scenario: name of the task sequence.
-      settings: of all members.
+      settings: settings that all members share.
       out: folder for the sweep, new or empty.
-      axis: a setting and its values; repeat the flag for more axes.
+      axis: a setting and its values; repeat the flag for more axes. The setting must be
+        marked as an axis in the documentation.
       resume: continue the sweep in this folder.
       random: number of random configurations, instead of all combinations. Each axis
-        then has two values, the ends of its range.
+        then has two values, the ends of its range, or one fixed value.
       halving: after each task, keep the best 1 / HALVING of the configurations.
-      members_per_batch: most members trained at the same time; 0 for as many as fit.
+      members_per_batch: largest number of members trained at the same time; 0 for as
+        many as fit, but at most 8 for each CPU device.
       join: help the process that started or resumed the sweep in --out; give the same
         command otherwise.
       log: also log scalars to tensorboard, wandb, or both.
@@ -108,10 +112,10 @@ class Sweep(Flags):
     log: tuple[str, ...] = ()
 
     def __call__(self, scenario: Scenario) -> None:
-        """Trains, on a scenario that is made already."""
+        """Trains on a scenario object, then prints the sweep's report."""
         given = [(name.replace("-", "_"), values) for name, values in self.axis]
         for name, count in Counter(name for name, _ in given).items():
-            require(count == 1, f"{name} is an axis twice: give its values at once")
+            require(count == 1, f"{name} is an axis twice: give all its values once")
         for name, values in given:
             require(bool(values), f"--axis {name} needs values")
         folder = sweep.sweep(
@@ -134,13 +138,14 @@ class Sweep(Flags):
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Flags):
-    """Plays the tasks of a run with the trained policies, without exploration.
+    """Evaluates the trained policies of a run on its tasks, without exploration.
 
     Attributes:
       run: folder of the run.
-      stage: use the policies as they were after this task; the latest by default.
+      stage: use the policies as they were after this task, counted from 0; by default
+        the latest finished task.
       episodes: number of episodes for each task.
-      seed: of the episodes, not of the run.
+      seed: seed of the episodes; it is independent of the seed of the run.
       json: print rows as JSON instead of a table.
     """
 
@@ -151,7 +156,7 @@ class Evaluate(Flags):
     json: bool = False
 
     def __call__(self) -> None:
-        """Evaluates."""
+        """Prints the returns of each seed on each task, as a table or as JSON."""
         rows = evaluation.evaluate(
             self.run, stage=self.stage, episodes=self.episodes, seed=self.seed
         )
@@ -172,16 +177,18 @@ class Evaluate(Flags):
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Flags):
-    """Shows an episode of a run as a web page, and as a GIF where MuJoCo can draw.
+    """Writes an episode of a run as a web page, and as a GIF if MuJoCo can draw.
 
     Attributes:
       run: folder of the run or sweep.
-      task: which task to play, from 0.
-      seed: whose policy to use; the first seed's by default.
-      stage: use the policy as it was after this task; the latest by default.
-      member: of a sweep, instead of a seed: its number in members.csv.
-      episode: number of the episode; it determines where the episode starts.
-      out: the page; the GIF is written next to it.
+      task: index of the task, from 0.
+      seed: use the policy that was trained with this seed; by default the first seed.
+      stage: use the policy as it was after this task, counted from 0; by default the
+        latest finished task.
+      member: in a sweep, use the policy of this member instead of a seed; members.csv
+        lists the members.
+      episode: number of the episode; it determines the initial state.
+      out: file of the page; the GIF is written next to it.
       seconds: length of the GIF; 0 for no GIF.
     """
 
@@ -195,7 +202,7 @@ class Render(Flags):
     seconds: float = 10.0
 
     def __call__(self) -> None:
-        """Renders."""
+        """Renders, then prints a summary of the episode and the files written."""
         made = render.render(**vars(self))
         lines = made.title, made.caption, made.page, made.gif or made.note
         print(*filter(None, lines), sep="\n")
@@ -203,15 +210,16 @@ class Render(Flags):
 
 @dataclass(frozen=True, kw_only=True)
 class Report(Flags):
-    """Writes tables and plots of runs on the same scenario, from their files alone.
+    """Writes tables and plots of runs on the same scenario, only from their files.
 
     Attributes:
-      runs: folders of runs, finished or not, or of one sweep. A SAC-N run among them
-        normalises the others.
+      runs: folders of runs, finished or not, or of one sweep. On Brax, if exactly one
+        of them is a usable SAC-N run, all scores are divided by its performance.
       out: folder for the report; an earlier report there is replaced.
-      single: folders of runs on one task each, with the same budget; with them the
-        report has Continual World's forward transfer.
-      success: count an episode as solved if any step is, or only the last.
+      single: folders of runs on one task each, with the same budget; the report then
+        includes Continual World's forward transfer.
+      success: count an episode as solved if it is solved at any step, or only if it is
+        solved at the last step.
     """
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -220,7 +228,7 @@ class Report(Flags):
     success: Success = "any"
 
     def __call__(self) -> None:
-        """Reports."""
+        """Writes the report, then prints its tables."""
         made = write_report(
             self.runs, self.out, single=self.single, success=self.success
         )
@@ -229,11 +237,11 @@ class Report(Flags):
 
 @dataclass(frozen=True, kw_only=True)
 class Info(Flags):
-    """Shows tasks, budgets, backend, and the model size of each method.
+    """Prints tasks, budgets, backend, and the model size of each method.
 
     Attributes:
       scenario: name of the task sequence.
-      backend: physics backend; the domain's first by default.
+      backend: physics backend; by default the first backend of the domain.
       json: print JSON instead of text.
     """
 
@@ -242,7 +250,7 @@ class Info(Flags):
     json: bool = False
 
     def __call__(self) -> None:
-        """Informs."""
+        """Prints the facts about the scenario, as text or as JSON."""
         facts = evaluation.info(make_scenario(self.scenario, self.backend))
         if self.json:
             print(json.dumps(facts, indent=1))
@@ -261,7 +269,7 @@ class Info(Flags):
 
 @dataclass(frozen=True, kw_only=True)
 class List(Flags):
-    """Lists scenarios and methods.
+    """Prints the names of scenarios and methods.
 
     Attributes:
       json: print JSON instead of text.
@@ -270,7 +278,7 @@ class List(Flags):
     json: bool = False
 
     def __call__(self) -> None:
-        """Lists."""
+        """Prints the names, as text or as JSON."""
         names = {"scenarios": list(list_scenarios()), "methods": sorted(METHODS)}
         if self.json:
             print(json.dumps(names, indent=1))

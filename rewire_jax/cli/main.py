@@ -59,7 +59,7 @@ def _stoppable() -> Iterator[None]:
             # A live display has hidden the cursor.
             Console(stderr=True).show_cursor()
             print(
-                "stopped at once: what was saved stays; training goes on with --resume",
+                "stopped immediately: checkpoints remain; continue with --resume",
                 file=sys.stderr,
                 flush=True,
             )
@@ -70,12 +70,12 @@ def _stoppable() -> Iterator[None]:
             yield
         finally:
             over.set()
-            if heard.is_set():  # The process ends, and has no more to say.
+            if heard.is_set():  # The process ends and prints nothing more.
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _unraisable(report: "sys.UnraisableHookArgs") -> None:
-    """Prints an error in a thread of a library, but for those after a failed write.
+    """Prints an error in a library's thread, except those after a failed write.
 
     Orbax closes its event loop when an array cannot be written, as on a full disk. Then
     TensorStore has no loop to tell of the other arrays, and says so for each of them.

@@ -69,7 +69,7 @@ class SacSettings:
       reward_scale: factor on rewards in the critics' targets.
       target_multiplier: the target entropy is minus this number times the action size.
       initial_temperature: entropy temperature at the start of every task.
-      discount: of future rewards, per step.
+      discount: discount of future rewards, per step.
       target_rate: share by which a target update moves the targets to the critics.
       hidden: neurons in each hidden layer.
       depth: hidden layers of the policy and of each critic.
@@ -78,12 +78,12 @@ class SacSettings:
       target_delay: critic updates for each update of the targets.
       time_limit: "terminal" treats a time limit as the end of the return; "bootstrap"
         adds the value of the state there.
-      critic_entropy: the -log π of the next action in the critics' target: "sample"
-        takes that of each action, "batch_mean" the mean over the batch, as broadcasting
-        does in the authors' code.
-      policy_states: states in the losses of policy and temperature: "current" takes the
-        first state of each transition, "both" also the last. After an ended episode,
-        the last state in the authors' code is the first of the next episode.
+      critic_entropy: log-density of the next action in the critics' target: "sample"
+        uses that of each action; "batch_mean" uses the mean over the batch, which has
+        the same gradient as the loss in the authors' code.
+      policy_states: states in the losses of policy and temperature: "current" uses the
+        first state of each transition; "both" uses the first and the next state, as in
+        the authors' code.
       noise_color: color of the exploration noise: 0 is white, 1 pink, 2 red
         (Eberhard et al., ICLR 2023). Updates always draw white noise.
     """
@@ -238,7 +238,7 @@ def check_kinds(group: Any) -> None:
 
 
 def validate(run: Settings) -> None:
-    """Raises `UserError` if a value of `run` or `run.sac` makes no sense.
+    """Raises `UserError` if a value of `run` or `run.sac` is invalid.
 
     Of the method's own options it checks only the types.
     """
@@ -281,7 +281,7 @@ def from_json(data: dict[str, Any], options: type) -> Settings:
     """The settings that `to_json` wrote; `options` is the method's settings class.
 
     Raises:
-      UserError: if a field is missing or unknown, or its value makes no sense.
+      UserError: if a field is missing or unknown, or its value is invalid.
     """
     try:
         parts = {

@@ -122,7 +122,7 @@ class TaskChange:
       friction: factor on the friction of every geometry.
       bodies: body name -> factor on its mass and collision radius.
       actions: joint name -> factor on its action (0 masks, -1 inverts);
-        the name `"*"` stands for all joints.
+        the name `"*"` means all joints.
       hidden: share of the observation entries that are masked to 0, by a fixed
         random choice.
       extra: values with a meaning in this domain only.

@@ -97,7 +97,7 @@ def _make_environment(env: PipelineEnv) -> Environment:
         )
 
     def step(task: Task, state: State, action: jax.Array) -> State:
-        # Of its own state, brax's step reads the pipeline state alone.
+        # Of its own state, brax's step reads only the pipeline state.
         before = BraxState(
             pipeline_state=state.inner,
             obs=state.observation,

@@ -74,7 +74,7 @@ class Systems:
 
     Attributes:
       env: the environment of `brax.v1`.
-      config: of the unchanged domain.
+      config: config of the unchanged domain.
       bodies: index of every moving body by its name.
     """
 
@@ -164,7 +164,7 @@ def _make_environment(systems: Systems) -> Environment:
         )
 
     def step(task: Task, state: State, action: jax.Array) -> State:
-        # Of its own state, the environment's step reads the bodies alone.
+        # Of its own state, the environment's step reads only the bodies.
         none = jnp.zeros(())
         before = make_state(state.inner, state.observation, none, none)
         # Scaled first, so that the control cost is charged on what acts.

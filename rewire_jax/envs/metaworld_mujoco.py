@@ -28,7 +28,7 @@ def make_environment(reward: str, names: tuple[str, ...]) -> HostEnvironment:
 
     Args:
       reward: `"v1"` or `"v2"`.
-      names: of `NAMES`.
+      names: some of `NAMES`.
 
     Returns:
       The environment, which makes a `Simulator`.

@@ -59,7 +59,7 @@ def make_domain(name: str) -> Domain:
 
     Returns:
       The domain. `make_task` understands `actions` (joints `x` and, in `reach`,
-      `y`), `hidden` and, in `reach` alone, `extra["goal"]`, two coordinates.
+      `y`), `hidden` and, only in `reach`, `extra["goal"]`, two coordinates.
 
     Raises:
       UserError: no such probe.

@@ -85,11 +85,12 @@ class Scenario:
     """A scenario that can be run.
 
     Attributes:
-      name: of its spec.
+      name: name in its spec.
       domain: name of its domain.
       backend: physics backend, `"probe"` for a probe.
       reward: version of the rewards, where the domain has several.
-      environment: of all tasks; the same object for each domain and backend.
+      environment: environment of all tasks; the same object for each domain and
+        backend.
       tasks: the whole sequence, repeats included.
       distinct: number of distinct tasks.
       interactions: environment steps of training for each task.
@@ -297,7 +298,7 @@ for _name, _tasks in (
     ),
 ):
     register_scenario(_continual_world_spec(_name, _tasks))
-# Each task alone, as the reference for forward transfer.
+# Each single task, as the reference for forward transfer.
 for _change in SCENARIOS["continual_world/cw10"].changes:
     register_scenario(_continual_world_spec(_change.name, _change.name))
 register_scenario(

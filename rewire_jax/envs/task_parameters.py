@@ -19,7 +19,7 @@ def action_scale(joints: Sequence[str], factors: Mapping[str, float]) -> jax.Arr
     Args:
       joints: the joint that each action drives, in action order.
       factors: joint name -> factor; `"*"` applies to every joint. A joint named
-        beside `"*"` gets the product of both.
+        in addition to `"*"` gets the product of both.
 
     Returns:
       `[actions]` float32.
@@ -69,7 +69,7 @@ def physical_domain(
       environment: shared by all tasks.
       joints: the joint that each action drives, in action order.
       bodies: names of those that a change may name.
-      physics: of a task, from a valid change.
+      physics: physics of a task, from a valid change.
     """
 
     def make_task(change: TaskChange) -> Task:

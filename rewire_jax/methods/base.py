@@ -12,20 +12,20 @@ from rewire_jax.core.transition import Batch
 Params = Any
 """Pytree that the policy's optimiser trains."""
 MethodState = Any
-"""Pytree that a method carries from task to task, with its slots from the start."""
+"""Pytree that a method carries from task to task. Its shapes never change."""
 Extras = Any
 """Pytree that a method stores with each transition."""
 Context = Any
-"""Pytree of what a method draws for one update or one acting step."""
+"""Pytree that a method draws at random for one update or one acting step."""
 Policy = Any
 """Pytree from which `Method.act` computes actions; parts of it may be `Shared`."""
 CandidateScore = Literal["episode", "since_reset"]
 Purpose = Literal["act", "critic", "policy"]
-"""What a context is drawn for, which is a step or an update of critics or policy."""
+"""The use of a context: an acting step, or an update of the critics or the policy."""
 
 
 class Spec(NamedTuple):
-    """Static sizes a method builds its arrays from.
+    """Static sizes from which a method builds its arrays.
 
     Attributes:
       observations: length of an observation.
@@ -42,18 +42,17 @@ class Spec(NamedTuple):
     tasks: int
 
     def sizes(self, width: int = 0) -> list[int]:
-        """Layer sizes of a plain policy; `width` 0 stands for `hidden`."""
+        """Layer sizes of a plain policy, one MLP; `width` 0 means `hidden` neurons."""
         hidden = [width or self.hidden] * self.depth
         return [self.observations, *hidden, 2 * self.actions]
 
 
 class Tools(NamedTuple):
-    """What a method may use at the end of a task's interactions.
+    """Functions that `Consolidate` may call.
 
     Attributes:
-      sample: `(key, count) -> Batch`, `[count]` transitions of the task.
-      q: `(context, observation, action) -> [2, count]`, both critics' values of
-        `[count, ...]` observations and actions.
+      sample: `(key, count) -> Batch`, draws `[count]` transitions of the task.
+      q: `(context, observation, action) -> [2, count]`, values from both critics.
     """
 
     sample: Callable[[jax.Array, int], Batch]
@@ -61,11 +60,11 @@ class Tools(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Policies that a method wants rolled out on the current task.
+    """Policies among which a method chooses by their return on the current task.
 
     Attributes:
       policies: a `Policy` with a leading axis `[candidates]`.
-      valid: `[candidates]` bool; the others are neither counted nor chosen.
+      valid: `[candidates]` bool; the others are neither counted nor to be chosen.
     """
 
     policies: Policy
@@ -73,20 +72,20 @@ class Candidates(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """A part that is the same in all of a member's policies, and stored once."""
+    """A part that all of a member's policies have in common; it is stored once."""
 
     value: Any
 
 
 def map_own(function: Callable[[jax.Array], Any], policies: Any) -> Any:
-    """Maps the arrays of stacked policies, but for what they share."""
+    """Maps a function over the arrays of stacked policies, except `Shared` parts."""
     return jax.tree.map(
         lambda x: x if isinstance(x, Shared) else function(x), policies, is_leaf=_shared
     )
 
 
 def axes(policies: Any) -> Any:
-    """For `vmap` over stacked policies: 0, but None for what they share."""
+    """Returns the `vmap` axes of stacked policies: None for `Shared` parts, else 0."""
     return jax.tree.map(
         lambda x: None if isinstance(x, Shared) else 0, policies, is_leaf=_shared
     )
@@ -97,11 +96,11 @@ def _shared(part: Any) -> bool:
 
 
 class Selection(NamedTuple):
-    """Mean returns of a method's candidates on the task just trained.
+    """Mean returns of a method's candidates; all are 0 if no candidate was valid.
 
     Attributes:
-      before: `[candidates]`, when the task began; None without `Method.baseline`.
-      after: `[candidates]`, at its end.
+      before: `[candidates]`, at the task's start; None without `Method.baseline`.
+      after: `[candidates]`, at the task's end.
     """
 
     before: jax.Array | None
@@ -109,15 +108,15 @@ class Selection(NamedTuple):
 
 
 class Init(Protocol):
-    """Parameters and state before the first task."""
+    """Returns parameters and state; called once, before the first task."""
 
     def __call__(self, key: jax.Array, /) -> tuple[Params, MethodState]: ...
 
 
 class Distribution(Protocol):
-    """Mean and log-std of the Gaussian before the squashing, `[..., actions]` each.
+    """Returns mean and log-std before the tanh; called in each acting step and update.
 
-    It is given `[..., observations]`.
+    They are `[..., actions]` each, for observations `[..., observations]`.
     """
 
     def __call__(
@@ -131,10 +130,9 @@ class Distribution(Protocol):
 
 
 class PolicyOf(Protocol):
-    """The policy for a task, after any number of finished tasks.
+    """Returns the policy for a task; called for all tasks before each evaluation.
 
-    A task not yet seen gets the latest policy, or the one that the method knows to
-    belong to it.
+    A task not yet trained gets the latest policy, or one known to belong to it.
     """
 
     def __call__(
@@ -143,7 +141,11 @@ class PolicyOf(Protocol):
 
 
 class Act(Protocol):
-    """What `Distribution` gives, from a policy; the same object for all members."""
+    """Returns mean and log-std of a `Policy`; called in each step of an evaluation.
+
+    It must be the same function object each time the method is made, because compiled
+    evaluations are cached by it.
+    """
 
     def __call__(
         self, policy: Policy, observation: jax.Array, /
@@ -151,15 +153,18 @@ class Act(Protocol):
 
 
 class Size(Protocol):
-    """`[]`, how many numbers are stored for all policies."""
+    """Returns `[]`, how many numbers are stored; called at each evaluation.
+
+    Not only policies count: rewire and EWC also count previous weights.
+    """
 
     def __call__(self, params: Params, state: MethodState, /) -> jax.Array: ...
 
 
 class StartTask(Protocol):
-    """Parameters and state at a task's start.
+    """Changes parameters and state; called at the start of each task.
 
-    Optimisers and temperature start anew by themselves.
+    The loop itself resets the optimisers, the temperature and the target critics.
     """
 
     def __call__(
@@ -168,10 +173,11 @@ class StartTask(Protocol):
 
 
 class ExtrasOf(Protocol):
-    """Extras `[envs, ...]` that are stored with the transitions of a step.
+    """Returns extras `[envs, ...]`, stored with the step; called in each acting step.
 
-    `steps` `[envs]` counts those of the running episodes. `extras` are those of the
-    step before, None in a task's first.
+    `steps` `[envs]` counts the steps made in the running episodes. `extras` is the
+    result of the previous call. At a task's start there is one extra call with None.
+    Its result is not stored: it is passed to the call for the first step.
     """
 
     def __call__(
@@ -180,9 +186,10 @@ class ExtrasOf(Protocol):
 
 
 class ContextOf(Protocol):
-    """What is drawn for an update or an acting step.
+    """Returns a random draw, for an acting step or an update; called for each of them.
 
-    `extras` `[batch, ...]` are those of its transitions.
+    An update calls it for the critics and for the policy. `extras` `[batch, ...]` are
+    those of the same transitions.
     """
 
     def __call__(
@@ -191,9 +198,10 @@ class ContextOf(Protocol):
 
 
 class Penalty(Protocol):
-    """A loss `[]`, added to SAC's policy loss, and metrics of it by name.
+    """Returns a loss `[]` and metrics by name; called in each update of the policy.
 
-    `gaussian` is what `Distribution` gave for the same arguments.
+    The loss is added to SAC's policy loss. `gaussian` is what `Distribution` returned
+    for the same arguments.
     """
 
     def __call__(
@@ -209,7 +217,7 @@ class Penalty(Protocol):
 
 
 class Inspect(Protocol):
-    """Metrics `[]` by name, from a batch of observations, once a progress report."""
+    """Returns metrics `[]` from `[batch]` observations; called for each report."""
 
     def __call__(
         self, params: Params, state: MethodState, observation: jax.Array, /
@@ -217,22 +225,26 @@ class Inspect(Protocol):
 
 
 class AdjustUpdates(Protocol):
-    """The updates of the parameters, changed after the optimiser."""
+    """Changes what will be added to the parameters; called after the optimiser."""
 
     def __call__(self, updates: Params, state: MethodState, /) -> Params: ...
 
 
 class CriticInput(Protocol):
-    """`[..., observations + critic_extra]`, what critics see beside the action.
+    """Returns the critics' input besides the action; called at each of their uses.
 
-    Of a stored transition its extras are given as the context.
+    It is `[..., observations + critic_extra]`. For stored actions, `context` is the
+    extras stored with them.
     """
 
     def __call__(self, context: Context, observation: jax.Array, /) -> jax.Array: ...
 
 
 class Consolidate(Protocol):
-    """Parameters and state once a task's interactions are over."""
+    """Changes parameters and state; called after the last interaction of each task.
+
+    The offline updates and the candidates' evaluation come later.
+    """
 
     def __call__(
         self,
@@ -246,7 +258,7 @@ class Consolidate(Protocol):
 
 
 class CandidatesOf(Protocol):
-    """Policies that are rolled out at the end of a task, to choose among them."""
+    """Returns policies to choose from; called after a task (`baseline`: and before)."""
 
     def __call__(
         self, params: Params, state: MethodState, task: jax.Array, /
@@ -254,7 +266,10 @@ class CandidatesOf(Protocol):
 
 
 class EndTask(Protocol):
-    """Parameters and state after a task; the selection is None where none was made."""
+    """Changes parameters and state; called after the candidates' evaluation.
+
+    `selection` is None if the method has no candidates or `selection_episodes` is 0.
+    """
 
     def __call__(
         self,
@@ -269,36 +284,24 @@ class EndTask(Protocol):
 class Method(NamedTuple):
     """A method as pure functions of one member of a population.
 
-    It is made by `make(spec, settings)` inside traced code, so that the settings'
-    numbers may differ between the members of a population. `task` is a `[]` int,
-    the index in the sequence. Only `init`, `distribution`, `policy`, `act` and `size`
-    are required. The type of each function says what it receives and returns.
+    A population is all members that one program trains; a member is one configuration
+    with one seed. The loop calls `make(spec, settings)` in traced code, so that numeric
+    settings may differ between members. `task` is a `[]` int, an index in the sequence.
+
+    Only `init`, `distribution`, `policy`, `act` and `size` are required. The type of
+    each function says when the loop calls it. The loop itself reads the other fields.
 
     Attributes:
-      init: parameters and state before the first task.
-      distribution: the policy in training, a Gaussian before the squashing.
-      policy: what acts in a task, for evaluation and for users.
-      act: the Gaussian of such a policy.
-      size: numbers stored.
-      start_task: changes parameters and state when a task starts.
-      extras: data stored with each transition.
-      context: random draws for an update or a step.
-      penalty: a loss added to SAC's policy loss.
-      inspect: metrics for progress reports.
-      adjust_updates: changes the optimiser's updates.
-      critic_input: what critics see besides the action.
-      consolidate: changes parameters and state after a task's interactions.
-      candidates: policies to choose from at a task's end.
-      end_task: changes parameters and state at a task's end.
-      critic_extra: numbers in `critic_input` beyond the observation.
-      fresh_critic: whether the critics, too, start anew with each task.
-      offline: updates from the buffer after `consolidate`, which they need, a share of
-        the interactions. They begin with fresh optimisers and temperature.
-      offline_sac: SAC's settings for these, from those of the run.
-      baseline: whether candidates are rolled out at a task's start, too.
-      in_budget: whether these interactions are part of the task's own.
-      candidate_score: what a candidate is judged by: the return of its "episode", or,
-        after as many steps as an episode has, that "since_reset", the latest reset.
+      critic_extra: length of the critics' input besides observation and action.
+      fresh_critic: whether each task starts with newly initialised critics.
+      offline: updates after `consolidate`, divided by the task's interactions. They
+        require `consolidate`, after which optimisers and temperature are reset again.
+      offline_sac: SAC's settings in these updates, computed from those of the run.
+      baseline: whether candidates are also evaluated at the start of each task.
+      in_budget: whether the candidates' steps are taken from the task's budget.
+      candidate_score: "episode": the return of an episode; "since_reset": the return
+        since the latest reset, of `episode_length - 1` steps that continue after a
+        terminal state.
     """
 
     init: Init
@@ -326,20 +329,20 @@ class Method(NamedTuple):
 
 
 def count(tree: Any) -> int:
-    """How many numbers a pytree of arrays holds."""
+    """Returns how many numbers a pytree of arrays holds."""
     return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 def tile(tree: Any, copies: int) -> Any:
-    """Copies of a pytree's arrays, stacked on a new leading axis."""
+    """Returns copies of a pytree's arrays, stacked on a new leading axis."""
     return jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * x.ndim)), tree)
 
 
 def at(tree: Any, index: jax.Array) -> Any:
-    """The entries of a stacked pytree at an index."""
+    """Returns the entries of a stacked pytree at an index."""
     return jax.tree.map(lambda x: x[index], tree)
 
 
 def put(tree: Any, index: jax.Array, value: Any) -> Any:
-    """A stacked pytree with the entries at an index replaced."""
+    """Returns a stacked pytree with the entries at an index replaced."""
     return jax.tree.map(lambda x, v: x.at[index].set(v), tree, value)

@@ -1,7 +1,7 @@
 """CSP: a subspace of policies, spanned by anchors (Gaya et al., arXiv 2211.10110).
 
-`csp` puts the method together from the functions of this file, each of which is given
-the sizes and the settings first.
+`csp` builds the method from the functions of this file. The first argument of each is
+its `Design`. *Weights* in this file are mixture weights of anchors.
 """
 
 from functools import partial
@@ -31,14 +31,14 @@ Params = tuple[Linear, ...]
 
 
 class State(NamedTuple):
-    """What is kept from task to task.
+    """The state that is carried from task to task.
 
     Attributes:
       learned: `[]` int32, finished tasks.
-      frozen: `[]` int32, anchors kept. Slots from here on hold zeros; while a task
-        is trained, the first of them stands for the newest anchor.
+      frozen: `[]` int32, number of anchors kept. In the arrays below, entries from
+        this index on are unused; during training, this index means the newest anchor.
       anchors: layers stacked on a leading axis `[tasks]`.
-      best: `[tasks, tasks]`, each finished task's weights of the anchors.
+      best: `[tasks, tasks]`, for each finished task the weights of the anchors.
       proposals: `[rollouts, tasks]`, weights that the search found: the first half
         in the new subspace, the second in the former.
     """
@@ -51,7 +51,7 @@ class State(NamedTuple):
 
 
 class Design(NamedTuple):
-    """What the method's functions are made from; only numbers in it may be traced.
+    """The first argument of the method's functions; only its floats may be traced.
 
     Attributes:
       spec: sizes of the networks and of the sequence.
@@ -162,7 +162,7 @@ def distribution(
     x = observation
     for index, layer in enumerate(params):
         x = networks.activate(x) if index else x
-        # A layer is linear in its numbers, so that its outputs can be mixed.
+        # A layer is linear in its parameters, so its outputs can be mixed.
         frozen = state.anchors[index]
         outputs = jnp.einsum("...i,aoi->...ao", x, frozen.weight) + frozen.bias
         mixed = jnp.sum(context[..., None] * outputs, axis=-2)
@@ -224,13 +224,13 @@ def end_task(
     task: jax.Array,
     selection: Selection | None,
 ) -> tuple[Params, State]:
-    """Keeps the newest anchor if it is worth it, and the best weights found."""
+    """Keeps the newest anchor if it improves the return, and the best weights."""
     slot = jnp.arange(design.spec.tasks)
     weights = jnp.where(slot == state.frozen, 1.0, 0.0)
     kept = jnp.asarray(True)
     if selection is not None:
         half = design.options.rollouts // 2
-        # A return that is not a number must not win, as it would in argmax.
+        # NaN must not win, as it would in argmax.
         failed = jnp.isnan(selection.after)
         returns = jnp.where(failed, -jnp.inf, selection.after).reshape(2, half)
         new, former = jnp.max(returns, axis=1)
@@ -281,7 +281,7 @@ def dirichlet(
       key: a random key.
       slots: length of the weights.
       used: `[]` int, slots in use, at least 1.
-      shape: of the draws.
+      shape: shape of the draws.
       last: `[]`, the concentration of the last slot in use; None for 1.
 
     Returns:

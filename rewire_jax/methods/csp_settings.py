@@ -10,25 +10,30 @@ from rewire_jax.methods.base import CandidateScore
 
 @settings
 class CspSettings:
-    """The subspace of policies.
+    """CSP, the subspace of policies.
 
     Attributes:
-      width: neurons in each hidden layer of an anchor, 0 for the run's `hidden`.
-      distribution: what weights are drawn from in training: "flat" is
-        Dirichlet(1, ..., 1), "peaked" Dirichlet(1, ..., 1, n²) of n anchors, most
-        of it on the newest.
-      resample_every: steps of an episode for which drawn weights are held.
-      improvement: an anchor is kept if its best return exceeds the former
-        subspace's times one plus this; that asks for less where returns are negative.
-      samples: weights that the search draws from each of the two subspaces.
-      estimations: transitions over which it takes the mean of each one's value.
-      rollouts: weights that it proposes, half of them from either subspace.
-      next_weights: by which weights the next action is taken and valued in the
-        critics' target: "stored" those of the transition; "redrawn" others, as in the
-        authors' code, which makes the targets alike for all weights.
-      candidate_score: what proposed weights are judged by: "episode", the return of
-        their episodes; "since_reset", where the environment can end an episode, that
-        since its latest reset, as in the authors' code.
+      width: neurons in each hidden layer of an anchor, a network of the subspace; 0
+        means as many as in the critics.
+      distribution: distribution of the mixture weights of n anchors in training.
+        "flat" is Dirichlet(1, ..., 1). "peaked" is Dirichlet(1, ..., 1, n²), with most
+        weight on the newest anchor.
+      resample_every: steps of an episode after which new mixture weights are drawn.
+      improvement: the newest anchor is kept if the best return with it exceeds
+        (1 + this) times the best return without it. If returns are negative, this
+        makes it easier to keep the anchor.
+      samples: mixture weights that the search draws, with the newest anchor and
+        without it, this many each.
+      estimations: transitions over which the search averages the critics' values of
+        each of these mixture weights.
+      rollouts: mixture weights that the search proposes, half of them with the newest
+        anchor.
+      next_weights: mixture weights of the next action in the critics' target: "stored"
+        uses those of the transition; "redrawn" draws others, as in the authors' code,
+        so that targets do not depend on the mixture weights.
+      candidate_score: score of proposed mixture weights. "episode" is the return of
+        their episodes; "since_reset" is the return since the latest reset after
+        episode length - 1 steps, as in the authors' code.
     """
 
     width: int = 0
@@ -42,7 +47,7 @@ class CspSettings:
     candidate_score: CandidateScore = "episode"
 
     def checked(self) -> "CspSettings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         least = {"width": 0, "resample_every": 1, "estimations": 1, "rollouts": 2}
         for name, value in least.items():
             given = getattr(self, name)

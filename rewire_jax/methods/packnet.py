@@ -22,13 +22,13 @@ class PackNetSettings:
 
     Attributes:
       keep: share of each layer's weights, and of its biases, that a task keeps,
-        rounded up. After 1 / keep tasks at the latest the network is full: later
-        tasks find nothing to train and are played by the weights of those before.
-      finetune: updates of the kept weights after the pruning, for each interaction
-        of the task.
-      finetune_targets: which of these updates move the target critics: "delay" every
-        so many-th, as in training; "nested" those among them that also update the
-        policy, as in the authors' code.
+        rounded up. After at most 1 / keep tasks the network is full: later tasks train
+        nothing and use the weights of the earlier tasks.
+      finetune: number of updates of the kept weights after the pruning, divided by the
+        task's interactions.
+      finetune_targets: which of these updates also update the target critics. "delay":
+        as often as in training. "nested": only those that also update the policy, as in
+        the authors' code.
     """
 
     keep: float = 0.125
@@ -36,7 +36,7 @@ class PackNetSettings:
     finetune_targets: Literal["delay", "nested"] = "delay"
 
     def checked(self) -> "PackNetSettings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         require(0 < self.keep <= 1, f"--keep must lie in (0, 1], not {self.keep}")
         require(
             0 <= self.finetune < jnp.inf,
@@ -46,7 +46,7 @@ class PackNetSettings:
 
 
 def preset(scenario: str, period: int, profile: str) -> PackNetSettings:
-    """Published settings, with room for every task of a round.
+    """Published settings, with weights left for every task of a round.
 
     Published are 12.5% for each task, and 100,000 updates after 1M interactions or,
     on Humanoid, 2M.
@@ -59,11 +59,11 @@ def preset(scenario: str, period: int, profile: str) -> PackNetSettings:
 
 
 class State(NamedTuple):
-    """Who owns what.
+    """The owners of the weights.
 
     Attributes:
       learned: `[]` number of finished tasks.
-      owners: for every weight and bias the task that keeps it, or `FREE`.
+      owners: for every weight and bias, the task that keeps it, or `FREE`.
       trained: `[]` owner of the weights that updates change: `FREE` until the
         pruning, then the task.
     """
@@ -101,7 +101,7 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
             params,
             state.owners,
         )
-        # What is pruned starts the next task at 0.
+        # Pruned weights are 0 at the start of the next task.
         params = jax.tree.map(
             lambda x, owner: jnp.where(owner == FREE, 0.0, x), params, owners
         )
@@ -121,8 +121,8 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
         )
 
     def policy(params, state, task):
-        # Whole for a task not yet learned: beyond what is owned it holds zeros, or,
-        # before the first task, the weights that it will start from.
+        # A task that was not trained yet gets all weights. Those without an owner are
+        # zeros or, before the first task, the initial weights.
         def part(x, owner):
             kept = (owner != FREE) & (owner <= task)
             return jnp.where(kept | (task >= state.learned), x, 0.0)
@@ -151,8 +151,8 @@ def largest(x: jax.Array, free: jax.Array, keep: ArrayLike) -> jax.Array:
     Args:
       x: array of any shape.
       free: bool, of its shape.
-      keep: share of all its entries to choose, rounded up; at most those free are.
-        Of equal magnitudes the first are chosen.
+      keep: share of all entries to choose, rounded up; at most all free entries. Of
+        equal magnitudes the first are chosen.
     """
     magnitude = jnp.where(free, jnp.abs(x), -1.0).ravel()
     ranks = jnp.argsort(jnp.argsort(magnitude, descending=True))

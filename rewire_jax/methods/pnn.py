@@ -5,7 +5,7 @@ layer i but the first
 
     x_i = W_i h_{i-1} + U_i activate(V_i (a_i [h_{i-1} of column 0, ..., k - 1])),
 
-biases in W and U, and column 0 computes W_i h_{i-1} alone. Arrays have room for the
+biases in W and U, and column 0 computes only W_i h_{i-1}. Arrays have room for the
 whole sequence: the activations of columns that do not come before are zeros, so that
 their part of V neither matters nor learns.
 """
@@ -32,7 +32,7 @@ class PnnSettings:
     width: int = 96
 
     def checked(self) -> "PnnSettings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         require(self.width >= 1, f"--width must be at least 1, not {self.width}")
         return self
 
@@ -167,7 +167,7 @@ def act(policy: Policy, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
 def play(
     columns: Column, column: Column, place: jax.Array, observation: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean and log-std of a column; gradients flow into it alone.
+    """Mean and log-std of a column; gradients flow only into this column.
 
     Args:
       columns: `[tasks, ...]`, of which the first `place` come before it.

@@ -26,10 +26,10 @@ class Entry(NamedTuple):
         settings ready to use or raises `UserError`.
       preset: `(scenario name, period, profile) -> settings`; tasks recur after
         `period` places.
-      selection_episodes: that each of its candidates is played by default; None for
-        the profile's number.
-      together: makes the settings of members of one population alike in all that
-        shapes the program.
+      selection_episodes: default number of episodes of each candidate; None for the
+        profile's value.
+      together: returns the settings of a population's members with equal static
+        values.
     """
 
     make: Callable[[Spec, Any], Method]

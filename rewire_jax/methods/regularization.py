@@ -22,13 +22,13 @@ class FtL2Settings:
     """FT-L2.
 
     Attributes:
-      coefficient: weight of the squared distance to the last task's policy.
+      coefficient: weight of the squared distance to the previous task's parameters.
     """
 
     coefficient: float = 1.0
 
     def checked(self) -> "FtL2Settings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         _check_coefficient(self.coefficient)
         return self
 
@@ -38,16 +38,17 @@ class EwcSettings:
     """Elastic weight consolidation.
 
     Attributes:
-      coefficient: weight of the squared distance to the last task's policy, each
-        of its terms times the Fisher information.
-      fisher_states: states of a task that its Fisher information is a mean over.
+      coefficient: weight of the squared distance to the previous task's parameters. The
+        Fisher information multiplies each term of the distance.
+      fisher_states: number of states over which a task's Fisher information is
+        averaged.
     """
 
     coefficient: float = 1.0
     fisher_states: int = 1024
 
     def checked(self) -> "EwcSettings":
-        """The settings as they are; `UserError` if they make no sense."""
+        """Returns the settings; `UserError` if one is invalid."""
         _check_coefficient(self.coefficient)
         require(
             self.fisher_states >= 1,
@@ -185,7 +186,7 @@ def fisher_diagonal(
     at least 1e-5 before the mean over states.
 
     Args:
-      layers: of a plain policy.
+      layers: layers of a plain policy.
       states: `[states, observations]`.
 
     Returns:

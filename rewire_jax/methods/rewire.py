@@ -1,7 +1,7 @@
 """Rewire: multi-mode wirings, their cache, distillation and alignment.
 
-`rewire` puts the method together from the functions of this file, each of which is
-given its `Design` first. The losses are in `rewire_losses.py`.
+`rewire` builds the method from the functions of this file. The first argument of each
+is its `Design`. The losses are in `rewire_losses.py`.
 """
 
 from functools import partial
@@ -84,7 +84,7 @@ def init(design: Design, key: jax.Array) -> tuple[Params, State]:
 def start_task(
     design: Design, key: jax.Array, params: Params, state: State, task: jax.Array
 ) -> tuple[Params, State]:
-    """All modes start from the wiring of the known slot, the head from its head."""
+    """Starts all modes from a cached wiring, and the head from the head with it."""
     del key
     source = design.known_slot(state, task)
     head = at(params.heads, source)
@@ -100,7 +100,7 @@ def start_task(
 def draw_context(
     design: Design, key: jax.Array, state: State, purpose: Purpose, extras: object
 ) -> Context:
-    """A mode, another one, and noise on the scores unless it is for acting (Eq. 5)."""
+    """Draws a mode, another mode and, except for acting, noise on scores (Eq. 5)."""
     del state, extras
     modes, shape = design.modes, (design.spec.depth, design.n)
     mode_key, other_key, noise_key, key = jax.random.split(key, 4)
@@ -120,13 +120,13 @@ def forward(
     key: jax.Array,
     observation: jax.Array,
 ) -> Gaussian:
-    """The wired policy of a mode with `scores` `[L, n]`, in training (Eq. 2)."""
+    """Returns the wired policy of a mode with `scores` `[L, n]` (Eq. 2)."""
     x = observation
     for layer, v in zip(params.hidden, scores, strict=True):
         key, drop_key = jax.random.split(key)
         x = wired(layer, v, design.options.tau, x)
-        # The authors drop out before the permutation: the same but for the variance
-        # of the scores' gradient.
+        # The authors drop out before the permutation. Only the variance of the scores'
+        # gradient differs.
         x = _dropout(drop_key, x, design.options.dropout)
         x = networks.activate(x)
     head = at(params.heads, design.head_slot(state))
@@ -140,7 +140,7 @@ def distribution(
     context: Context,
     observation: jax.Array,
 ) -> Gaussian:
-    """The policy of the context's mode, with noise on its scores."""
+    """Returns the policy of the context's mode, with noise on its scores."""
     scores = params.scores[context.mode]
     if design.options.mode_rate == "gradient":
         # Adds exactly 0, so that close scores keep their order.
@@ -158,7 +158,7 @@ def penalty(
     observation: jax.Array,
     gaussian: Gaussian,
 ) -> tuple[jax.Array, Metrics]:
-    """512 alpha L_KL + beta L_SP. L_KL is 0 with one mode, L_SP in the first task."""
+    """Returns 512 alpha L_KL + beta L_SP; L_SP is 0 in the first task."""
     options = design.options
     scores = params.scores[context.other]
     other = forward(design, params, state, scores, key, observation)
@@ -186,7 +186,7 @@ def alignment_penalty(design: Design, params: Params, state: State) -> jax.Array
 
 
 def adjust_updates(design: Design, updates: Params, state: State) -> Params:
-    """The rates of scores (K times as high) and adapters."""
+    """Multiplies the updates of scores (by K) and adapters."""
     del state
     options = design.options
     rate = 1.0 if options.mode_rate == "gradient" else design.modes
@@ -199,7 +199,7 @@ def adjust_updates(design: Design, updates: Params, state: State) -> Params:
 
 
 def mode_policies(design: Design, params: Params, state: State) -> Policy:
-    """The policies of all modes as plain MLPs, on a leading axis `[mode_slots]`."""
+    """Returns all modes' policies as plain MLPs, stacked on an axis `[mode_slots]`."""
     head = at(params.heads, design.head_slot(state))
 
     def folded(scores):
@@ -217,7 +217,7 @@ def choosing(design: Design, state: State) -> jax.Array:
 def candidates(
     design: Design, params: Params, state: State, task: jax.Array
 ) -> Candidates:
-    """The policies of all modes."""
+    """Returns the policies of all modes."""
     del task
     valid = design.valid() & choosing(design, state)
     return Candidates(mode_policies(design, params, state), valid)
@@ -232,11 +232,11 @@ def inspect(
     gaussians = jax.vmap(networks.mlp_policy, (0, None))(policies, observation)
     against = jax.vmap(gaussian_kl, (None, 0))
     pairs = jnp.mean(jax.vmap(against, (0, None))(gaussians, gaussians), axis=-1)
-    # That of a mode with itself is 0.
+    # The divergence of a mode from itself is 0.
     total = jnp.sum(jnp.where(valid[:, None] & valid, pairs, 0.0))
     return {
         "mode_divergence": total / jnp.maximum(modes * (modes - 1), 1),
-        # Its gradient needs less than its value: updates do without.
+        # Updates need only its gradient, which is cheaper than its value.
         "alignment": alignment_penalty(design, params, state),
     }
 
@@ -244,15 +244,15 @@ def inspect(
 def select_order(
     design: Design, params: Params, state: State, selection: Selection | None
 ) -> tuple[jax.Array, jax.Array]:
-    """The order `[L, n]` of the best mode, and whether the task has failed, `[]` bool.
+    """Returns the order `[L, n]` of the best mode, and `[]` whether the task failed.
 
-    It has if no mode is as good as all were, on average, when it began.
+    It failed if the best mode's return is below the modes' average before training.
     """
     if selection is None:
         return jnp.argsort(params.scores[0], axis=-1), jnp.asarray(False)
     assert selection.before is not None  # The method sets `baseline`.
     valid = design.valid()
-    # A return that is not a number must not win, as it would in argmax.
+    # NaN must not win, as it would in argmax.
     valued = valid & ~jnp.isnan(selection.after)
     after = jnp.where(valued, selection.after, -jnp.inf)
     before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / design.modes
@@ -270,7 +270,7 @@ def end_task(
 ) -> tuple[Params, State]:
     """Caches the chosen wiring and refines the others (Eq. 12).
 
-    After a task that has failed all is as it was when the task began.
+    If the task failed, everything is restored to its state before the task.
     """
     identity = wiring.identity_adapters(design.spec.depth, design.n)
     slot = task % design.slots
@@ -285,7 +285,7 @@ def end_task(
     latest = state.orders[design.known_slot(state, task) % design.cached]
     order = jnp.where(failed, latest, order)
     refined = wiring.refine(state.orders, params.adapters)
-    # Before the first task there is nothing the weights could be aligned with.
+    # In the first task there are no earlier weights to align with.
     refined = jnp.where(state.learned > 0, refined, state.orders)
     order = order.astype(refined.dtype)
     return Params(
@@ -302,14 +302,14 @@ def end_task(
 
 
 def policy(design: Design, params: Params, state: State, task: jax.Array) -> Policy:
-    """A plain MLP, in the order of the cached wiring."""
+    """Returns a plain MLP in the order of the cached wiring."""
     slot = design.known_slot(state, task)
     folded = wiring.fold(params.hidden, state.orders[slot % design.cached])
     return [*folded, at(params.heads, slot)]
 
 
 def size(design: Design, params: Params, state: State) -> jax.Array:
-    """See `base.Size`; of the places for modes, those in use."""
+    """See `base.Size`; counts only the modes in use."""
     one_mode = design.spec.depth * design.n
     stored = count(params) - (design.options.mode_slots - design.modes) * one_mode
     if design.options.alignment == "off":

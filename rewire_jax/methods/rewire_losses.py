@@ -21,11 +21,11 @@ Gaussian = tuple[jax.Array, jax.Array]
 def distillation_loss(
     other: Gaussian, own: Gaussian, form: Literal["kl", "squares"]
 ) -> jax.Array:
-    """L_KL, how far the mode in use is from another one (Eq. 6), or its stand-in.
+    """L_KL, the divergence of the drawn mode from another mode (Eq. 6), or `squares`.
 
     Args:
-      other: the other mode's Gaussians, without gradient.
-      own: those of the mode in use.
+      other: Gaussians of the other mode, without gradient.
+      own: Gaussians of the drawn mode.
       form: see `RewireSettings.distillation`.
 
     Returns:
@@ -49,7 +49,7 @@ def gaussian_kl(p: Gaussian, q: Gaussian) -> jax.Array:
 def squared_differences(p: Gaussian, q: Gaussian) -> jax.Array:
     """Summed squares of the differences of mean (p's within ±20) and log-std, `[...]`.
 
-    The authors' code takes it in place of `gaussian_kl`.
+    The authors' code uses it in place of `gaussian_kl`.
     """
     (p_mean, p_log_std), (q_mean, q_log_std) = p, q
     mean = (jnp.clip(p_mean, -20, 20) - q_mean) ** 2

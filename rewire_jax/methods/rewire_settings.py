@@ -18,36 +18,35 @@ class RewireSettings:
     """The rewiring method.
 
     Attributes:
-      modes: K, wirings learned side by side (Eq. 5).
-      mode_slots: places for modes in memory, at least `modes`; 0 stands for it.
-      alpha: weight of the distillation between modes, on the published scale: of
-        its sum over 512 states.
-      distillation: "kl" is Eq. 6; "squares" the authors' sum of squared
-        differences of mean and log-std.
+      modes: K, the number of wirings that are learned for a task (Eq. 5).
+      mode_slots: memory for this many modes, at least `modes`; 0 means `modes`.
+      alpha: weight of the distillation loss. On the published scale, it multiplies a
+        sum over 512 states.
+      distillation: "kl" is the KL divergence (Eq. 6); "squares" is the authors' sum of
+        squared differences of mean and log-std.
       beta: weight of the alignment loss.
-      alignment: "norm" is Eq. 11; "expanded" the authors' form of it, whose
-        gradient in the adapters differs; "off" holds the weights near the previous
-        ones as they are, and leaves the cached wirings alone (Table 3).
+      alignment: "norm" is Eq. 11. "expanded" is the authors' form; its gradient in the
+        adapters is different. "off" uses no adapters, pulls the weights towards the
+        previous weights, and does not change cached wirings (Table 3).
       caching: whether each task's wiring is cached; otherwise all tasks use the
-        latest (Table 3).
-      tau: temperature of the wirings' relaxation (Eq. 4).
-      adapter_tau: the same for the adapters.
+        latest wiring (Table 3).
+      tau: temperature of the relaxation of the wirings (Eq. 4).
+      adapter_tau: temperature of the relaxation of the adapters.
       adapter_rate: factor on the adapters' learning rate; 1 in the authors' code.
-        Adam at first moves the adapters' scores past each other, whatever the size
-        of their gradient. In the "expanded" form they then spread until their order
-        settles and the weights catch up with it, the sooner the higher the rate:
-        after some 10,000 policy updates at 1. In the "norm" form they never settle.
+        With "expanded", the order of the adapters changes at first and then
+        converges, earlier with a higher rate; with 1 it takes about 10,000 policy
+        updates. With "norm" it never converges.
       noise: scale of Gumbel noise on the scores in updates.
-      dropout: share of each hidden layer's output dropped in training.
-      mode_rate: the learning rate of scores is multiplied by K: "step" scales the
-        step as the paper has it, "gradient" the gradient as the authors' code,
-        which Adam all but undoes.
-      select_first: whether a mode is chosen by its return after the first task, too;
-        otherwise the first mode is kept there, as in the authors' code.
-      head_slots: output heads and cached orders; task t uses slot t mod this, so
-        that a repeated task finds its own again.
-      width: neurons in each hidden layer of the policy; 0 for as many as the critics
-        have. 384 is the paper's Ours-L (Fig. 4).
+      dropout: share of each hidden layer's output that is dropped in training.
+      mode_rate: what is multiplied by K. "step" multiplies the step of the scores, as
+        in the paper. "gradient" multiplies their gradient, as in the authors' code;
+        Adam almost cancels this factor.
+      select_first: whether a mode is chosen by its return also after the first task.
+        If not, the first mode is kept, as in the authors' code.
+      head_slots: number of output heads and of cached wirings. Task t uses number t
+        modulo this, so a repeated task uses its earlier head and wiring.
+      width: neurons in each hidden layer of the policy; 0 means as many as in the
+        critics. 384 is the paper's Ours-L (Fig. 4).
     """
 
     modes: int = traced(3)
@@ -68,11 +67,11 @@ class RewireSettings:
     width: int = 0
 
     def checked(self) -> "RewireSettings":
-        """The settings with their places counted; `UserError` if they make no sense."""
+        """Returns the settings with `mode_slots`; `UserError` if one is invalid."""
         require(self.modes >= 1, f"--modes must be at least 1, not {self.modes}")
         require(
             self.mode_slots == 0 or self.mode_slots >= self.modes,
-            f"--mode-slots {self.mode_slots} has no place for --modes {self.modes}",
+            f"--mode-slots {self.mode_slots} must be at least --modes {self.modes}",
         )
         require(self.head_slots >= 1, "--head-slots must be at least 1")
         require(self.width >= 0, f"--width must be at least 0, not {self.width}")
@@ -89,7 +88,7 @@ class RewireSettings:
 
 
 def together(members: Sequence[RewireSettings]) -> list[RewireSettings]:
-    """Settings with places for the modes of all of them."""
+    """Returns settings that all have memory for the largest number of modes."""
     places = max(max(options.modes, options.mode_slots) for options in members)
     return [dataclasses.replace(options, mode_slots=places) for options in members]
 
@@ -106,20 +105,20 @@ _PUBLISHED = {
     "ant/compositionality": (0.1, 0.0, 1e-5, 1.0, 4),
     "humanoid/hard": (0.1, 0.1, 1e-6, 0.0, 4),
 }
-# Ours, since none were published. Of tau and noise those that a small sweep on
-# window-close ranked first, alpha as elsewhere. The weights are held firmly there in
-# FT-L2: beta is as far below that one's coefficient as on halfcheetah/forgetting.
+# This library's choice, because none were published: the tau and noise that a small
+# sweep on window-close ranked first, and the alpha of the other scenarios. The ratio of
+# beta to FT-L2's coefficient is that of halfcheetah/forgetting.
 _CONTINUAL_WORLD = RewireSettings(tau=1.0, noise=0.1, alpha=1e-5, beta=1e3)
 
 
 def preset(scenario: str, period: int, profile: str) -> RewireSettings:
-    """Published settings, or others with a head for each task of a round.
+    """Returns published settings; by default a head for each different task.
 
-    On Continual World they are our own choice.
+    Those on Continual World are this library's choice.
 
     The published `alpha` and `beta` belong to the authors' forms of the losses. The
-    quick profile's `adapter_rate` is ours: in its few updates the adapters would else
-    not settle (see `adapter_rate`).
+    quick profile's `adapter_rate` is this library's choice: with 1, the adapters would
+    not converge in its few updates.
     """
     published = dataclasses.replace(
         _published(scenario, period), distillation="squares", alignment="expanded"

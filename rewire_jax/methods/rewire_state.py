@@ -12,12 +12,12 @@ from rewire_jax.nn.networks import Linear
 
 
 class Params(NamedTuple):
-    """What is trained.
+    """The trained parameters.
 
     Attributes:
       hidden: L layers.
       heads: output layers, stacked on a leading axis `[slots]`.
-      scores: `[modes, L, n]`, one wiring a mode.
+      scores: `[modes, L, n]`, a wiring for each mode.
       adapters: alignment of the previous weights with `hidden`.
     """
 
@@ -28,7 +28,7 @@ class Params(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is kept from task to task.
+    """The state that is carried from task to task.
 
     Attributes:
       learned: `[]` int32, finished tasks.
@@ -49,9 +49,9 @@ class Context(NamedTuple):
 
     Attributes:
       mode: `[]` int, the wiring to use.
-      other: `[]` int, another one, that is distilled; the same where K is 1.
-      noise: `[L, n]`, added to its scores.
-      key: for dropout.
+      other: `[]` int, another mode, the target of the distillation; `mode` if K is 1.
+      noise: `[L, n]`, added to the scores of `mode`.
+      key: key of dropout.
     """
 
     mode: jax.Array

@@ -13,8 +13,8 @@ from rewire_jax.nn.softsort_vjp import score_gradient
 _BLOCK = {"cpu": 32, "other": 256}
 """Least places in a block of the backward pass, by device.
 
-On "cpu" the quickest for 256 to 1024 scores and 18 to 512 columns, on two cores: to
-measure anew, time `score_gradient` with other blocks in a compiled loop. On "other"
+On "cpu" the fastest for 256 to 1024 scores and 18 to 512 columns, on two cores: to
+measure again, time `score_gradient` with other blocks in a compiled loop. On "other"
 devices a choice, not measured: one large product rather than many small kernels.
 """
 
@@ -103,10 +103,10 @@ permute_rows.defvjp(_rows_forward, _rows_backward)
 def _order(scores):
     """`argsort(scores)`, which takes three times as long on a CPU.
 
-    There, XLA sorts integers alone far quicker than pairs of anything. So the place
-    rides in the lower half of a sorted word, and first the lower, then the upper half
+    There, XLA sorts single integers much faster than pairs. So the place is
+    in the lower half of a sorted word, and first the lower, then the upper half
     of the score's bits in the other. Unlike counts of the smaller ones, a sort is never
-    fused with what makes the scores, which would be made anew for each comparison.
+    fused with what makes the scores, which would be computed again for each comparison.
     """
     n, half, sign = scores.shape[0], np.uint32(0xFFFF), np.uint32(1 << 31)
     if jax.default_backend() != "cpu" or scores.dtype != jnp.float32 or n > half:

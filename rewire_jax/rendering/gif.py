@@ -27,7 +27,7 @@ def write_gif(
 
     Args:
       film: at least two frames.
-      path: of the file.
+      path: path of the file.
       seconds: length of the beginning.
       width: in pixels; the model limits width and height.
       height: in pixels.

@@ -67,11 +67,11 @@ def render(
 
     Args:
       run: folder of the run, or of a sweep.
-      task: which task of the sequence to play, from 0.
-      seed: of the member whose policy plays; the run's first if None.
-      stage: use the policy from after this task's training; the latest if None.
+      task: index of the task, from 0.
+      seed: seed of the member whose policy acts; the first seed if None.
+      stage: use the policy from after this task; if None, after the latest task.
       member: only for a sweep, instead of the seed: a number in members.csv.
-      episode: a number that determines the start of the episode.
+      episode: a number that determines the initial state.
       out: the page; its name ends in `.html`. The GIF has the same name.
       seconds: length of the GIF; 0 for no GIF.
 

@@ -1,4 +1,4 @@
-"""The paper's own figures, to stand beside those of runs."""
+"""The paper's results, to compare with those of runs."""
 
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ class Source(NamedTuple):
     Attributes:
         table: where they stand in the paper.
         name: what they are of.
-        results: by method.
+        results: results by method.
         unit: what performance is measured in.
         made: how they differ from ours.
     """

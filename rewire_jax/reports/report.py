@@ -21,7 +21,7 @@ class Report(Generic[Numbers]):
 
     Attributes:
         folder: where it is written.
-        name: of its page.
+        name: name of its page.
         title: scenario, profile, budget, backend, seeds.
         notes: what a reader must know first.
         numbers: a `Comparison` of runs, or a `SweepSummary`.

@@ -49,7 +49,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
 
     Args:
         comparison: the numbers.
-        folder: of the report.
+        folder: folder of the report.
     """
     title, notes = _title(comparison), tuple(_notes(comparison))
     results, costs = run_tables.results(comparison), run_tables.costs(comparison)
@@ -155,7 +155,7 @@ def _json(comparison: Comparison, title: str, notes: tuple[str, ...]) -> str:
             "finished_tasks": summary.run.finished,
             "all_seeds": summary.run.seeds,
             "diverged": summary.run.diverged,
-            # The seeds whose `values` stand below, in their order.
+            # The seeds of the `values` below, in the same order.
             "kept": np.array(summary.run.seeds)[summary.run.kept].tolist(),
             "tasks": _tasks_json(summary.run, summary.tasks),
             "scores": summary.run.scores[summary.run.kept].tolist(),
@@ -206,7 +206,7 @@ def _tasks_json(run: RunData, tasks: Tasks) -> list[dict[str, Any]]:
 
 
 def _others_json(summary: Summary) -> dict[str, Any]:
-    """Scores that were measured beside the one of the report."""
+    """Scores that were measured in addition to the report's score."""
     run = summary.run
     others = {
         score.name: {

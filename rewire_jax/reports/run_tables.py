@@ -23,7 +23,7 @@ def tasks(comparison: Comparison) -> Table:
 
 
 def results(comparison: Comparison) -> Table:
-    """A row for each run in the form of the paper's Table 1, the paper's beside it."""
+    """A row for each run in the form of the paper's Table 1, next to the paper's."""
     heads = [
         "method",
         f"performance ({comparison.unit})",

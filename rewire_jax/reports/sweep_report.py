@@ -34,7 +34,7 @@ def make(summary: SweepSummary, folder: Path) -> Report[SweepSummary]:
 
     Args:
         summary: the numbers.
-        folder: of the report.
+        folder: folder of the report.
     """
     title, notes = _title(summary), tuple(_notes(summary))
     ranking = sweep_tables.ranking(summary)

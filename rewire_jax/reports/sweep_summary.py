@@ -17,7 +17,7 @@ class Configuration:
 
     Attributes:
         index: its number in the sweep.
-        values: by axis.
+        values: values by axis.
         members: their numbers.
         stage: after how many tasks its numbers are.
         stopped: whether it was halved away there.

@@ -21,8 +21,8 @@ def heading(
 
     Args:
         subject: what the title begins with.
-        settings: of the run.
-        tasks: of the sequence that it has.
+        settings: settings of the run.
+        tasks: number of trained tasks.
         seeds: how many, of each run.
         configurations: how many, each with all seeds; of a run 0.
     """

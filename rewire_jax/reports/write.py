@@ -1,4 +1,4 @@
-"""Writes the report of runs, or of a sweep, from their files alone."""
+"""Writes the report of runs, or of a sweep, only from their files."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,11 +27,11 @@ def write_report(
     Runs that know success are measured by their success rates, others by returns.
 
     Args:
-        folders: of the runs, or of the sweep.
+        folders: folders of the runs, or of the sweep.
         out: the folder to write into; made where missing, an old report is replaced.
         single: folders of finished runs that learn one task each, one for every task
             of the sequence: forward transfer of success rates is measured from them.
-        success: which steps of an episode count: "any", or the "last" alone.
+        success: steps of an episode that count: "any", or only the "last".
 
     Returns:
         The report, whose `numbers` are a `Comparison` or a `SweepSummary`.

@@ -91,7 +91,7 @@ def evaluate(
       run: folder of the run.
       stage: evaluate the policies from after this task's training; the latest if None.
       episodes: number for each task and member.
-      seed: of the episodes.
+      seed: seed of the episodes.
 
     Returns:
       A row for each member and task: task, name, seed (the member's), return, std (over

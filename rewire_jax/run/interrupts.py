@@ -70,7 +70,7 @@ def interruptible(
 
     Args:
       interrupt: told of the first; the run looks at it after each chunk.
-      folder: of the run.
+      folder: folder of the run.
       say: tells the user.
 
     Raises:

@@ -24,10 +24,10 @@ class Subject(NamedTuple):
     """The member whose scalars are logged.
 
     Attributes:
-      folder: of the run or sweep.
-      name: the member's, unique in the folder.
+      folder: folder of the run or sweep.
+      name: name of the member, unique in the folder.
       group: a name that all members share.
-      settings: the member's, JSON-ready.
+      settings: settings of the member, JSON-ready.
     """
 
     folder: Path

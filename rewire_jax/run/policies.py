@@ -31,8 +31,8 @@ class Policies(NamedTuple):
         `[]` int, `observation` `[..., observations]`. The action `[..., actions]` is in
         [-1, 1], without exploration. You can jit it, and vmap it over members, tasks
         or both. It raises `AssertionError` for observations of another length.
-      members: of all members, with a leading axis `[seeds]` on every leaf.
-      seeds: of the members, in their order.
+      members: values of all members, with a leading axis `[seeds]` on every leaf.
+      seeds: seeds of the members, in the same order.
       tasks: names of the sequence.
     """
 
@@ -56,7 +56,7 @@ def load_policy(
       run: folder of the run, or of a sweep.
       task: which task of the sequence to act in, from 0. A task not yet learned at
         that stage gets the latest policy.
-      seed: of the member; the run's first if None.
+      seed: seed of the member; the first seed of the run if None.
       stage: load the policy from after this task's training; the latest if None.
       member: only for a sweep, instead of the seed: a number in members.csv.
 

@@ -84,10 +84,10 @@ class Progress:
 
         Args:
             stage: index of the task in training.
-            interactions: of each member in this task so far.
+            interactions: interactions of each member in this task so far.
             returns: latest training return of each member; None if there is none yet.
             rate: interactions/s of all members together; None if unknown.
-            seconds_left: of the whole run; None if unknown.
+            seconds_left: remaining time of the whole run; None if unknown.
             note: anything else, such as "evaluating".
         """
         if self._live is None:

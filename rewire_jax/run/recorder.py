@@ -1,4 +1,4 @@
-"""What a run tells while it goes on: rows of its tables, logs and the display."""
+"""Records a run's progress: rows of its tables, logs, and the display."""
 
 from pathlib import Path
 
@@ -15,11 +15,12 @@ from rewire_jax.training.train_loop import ChunkMetrics
 
 
 class Recorder:
-    """Writes a run's tables; holds no learning state.
+    """Writes a run's tables and logs, and updates its display.
 
     Attributes:
-      ahead: populations that are still to be trained on a task after this one, from
-        which the time left is estimated.
+      ahead: how many more times a task will be trained after the current one. The
+        estimate of the remaining time depends on it. In a sweep each batch of members
+        counts.
     """
 
     def __init__(self, plan: Plan, folder: Path, progress: Progress, logs: Loggers):
@@ -37,14 +38,14 @@ class Recorder:
         compiled: bool,
         steps: int,
     ) -> None:
-        """A chunk of training.
+        """Records a chunk of training, the steps between two progress reports.
 
         Args:
-          now: where the run stands after it.
-          report: what happened, as NumPy arrays `[members]`.
-          seconds: that it took.
-          compiled: whether these include compiling.
-          steps: vector steps.
+          now: state of the run after the chunk.
+          report: metrics of the chunk, as NumPy arrays `[members]`.
+          seconds: duration of the chunk.
+          compiled: whether the duration includes compiling.
+          steps: vector steps in the chunk.
         """
         plan, settings, stage = self.plan, self.plan.settings, now.stage
         interactions = now.steps * settings.envs
@@ -57,14 +58,14 @@ class Recorder:
             total = run_state.interactions(now, plan)
             self.logs.scalars(place, "training", numbers, total)
         rate = steps * settings.envs * len(rows) / seconds
-        # As if steps that only update took as long as the others.
+        # The estimate assumes that offline updates take as long as vector steps.
         whole = plan.budget.steps + plan.budget.offline_steps
         left = (whole * (self.ahead + 1) - now.steps) * settings.envs
         length = plan.scenario.environment.episode_length
         self.progress.update(
             stage,
             interactions,
-            # Few steps end an episode: show what their reward makes in a whole one.
+            # Few episodes end in a chunk, so show the mean reward times their length.
             [_finite(float(x) / steps * length) for x in report.rewards[: len(rows)]],
             rate,
             None if compiled else left * len(rows) / rate,
@@ -73,7 +74,7 @@ class Recorder:
     def _training_rows(
         self, now: RunState, report: ChunkMetrics, steps: int
     ) -> list[dict[str, float | None]]:
-        """A row for each member: means over a chunk of so many steps."""
+        """Returns a row for each member: means over a chunk of `steps` vector steps."""
         rows = []
         for place, member in enumerate(self.plan.members):
             ended = int(report.episodes[place])
@@ -98,7 +99,7 @@ class Recorder:
         return rows
 
     def offline(self, now: RunState, seconds: float, compiled: bool) -> None:
-        """Updates without interactions; arguments as above."""
+        """Records offline updates; the arguments are those of `chunk`."""
         plan = self.plan
         done = now.steps - plan.budget.steps
         self._timing(now, plan.interactions, seconds, compiled, polishing=done)
@@ -130,23 +131,28 @@ class Recorder:
         run_folder.append(self.folder, "timing.jsonl", [row])
 
     def frozen(self, now: RunState, active: np.ndarray) -> None:
-        """Tells of members that are `active` `[members]` no more."""
+        """Prints a line for each member that has just become inactive.
+
+        Args:
+          now: state of the run before the chunk.
+          active: `[members]` bool, after the chunk.
+        """
         for place, member in enumerate(self.plan.members):
             if now.active[place] and not active[place]:
                 self.progress.message(
-                    f"{member.name}: a value is not finite in task {now.stage}; it is "
-                    "updated no more, try lower learning rates"
+                    f"{member.name}: a parameter became NaN or infinite in task "
+                    f"{now.stage}; it is no longer updated: try lower learning rates"
                 )
 
     def evaluation(
         self, now: RunState, stage: int, scores: dict[str, np.ndarray]
     ) -> None:
-        """The returns of all tasks.
+        """Records an evaluation of all tasks.
 
         Args:
-          now: where the run stands.
-          stage: the latest finished task; -1 before the first.
-          scores: `[members, tasks]` by name.
+          now: state of the run.
+          stage: the latest finished task; -1 before the first task.
+          scores: mean returns and success rates `[members, tasks]`, by name.
         """
         plan, settings = self.plan, self.plan.settings
         sizes = np.asarray(plan.program.size(plan.stacked, now.learner))
@@ -181,7 +187,13 @@ class Recorder:
             self.logs.scalars(place, "evaluation", known, interactions)
 
     def finished(self, stage: int, returns: np.ndarray, seconds: float) -> None:
-        """A task is over, with these returns `[members]` in it."""
+        """Shows that a task is finished.
+
+        Args:
+          stage: the task.
+          returns: `[members]`, returns on this task, evaluated after its training.
+          seconds: time since the start or the resumption of the task.
+        """
         means = [_finite(float(mean)) for mean in returns]
         self.progress.finish_task(stage, means, seconds)
 

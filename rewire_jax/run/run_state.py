@@ -1,8 +1,9 @@
-"""Where a run stands, and its checkpoints.
+"""The state of a run, and its checkpoints.
 
-`checkpoints/task-003` is what is kept for ever once three tasks are finished: policies
-and critics, since all else starts anew with a task. `checkpoints/task-003-step-0000200`
-is everything in the middle of the next one; only the last of these is kept.
+`checkpoints/task-003` is never deleted. It contains policies and critics after three
+finished tasks; everything else is reset at the start of a task.
+`checkpoints/task-003-step-0000200` contains everything in the middle of the next task;
+only the newest of these is kept.
 """
 
 from collections.abc import Callable
@@ -27,15 +28,15 @@ _FOLDER = "checkpoints"
 
 
 class RunState(NamedTuple):
-    """Where a run stands; between tasks `state` is None and `steps` 0.
+    """The state of a run; between tasks `state` is None and `steps` is 0.
 
     Attributes:
       stage: the task being trained, or to be trained next.
       steps: vector steps made in it.
-      learner: between tasks, what was learned.
-      state: within a task, all of it.
+      learner: between tasks, the learner.
+      state: within a task, the learner and all else.
       before: within a task, the candidates' returns at its start, or None.
-      active: `[members]` bool on the host, False for frozen members.
+      active: `[members]` bool on the host, False for members no longer updated.
       selection: `[members]` int, interactions spent on candidates so far.
     """
 
@@ -49,7 +50,7 @@ class RunState(NamedTuple):
 
 
 def start(plan: Plan) -> RunState:
-    """Before the first task."""
+    """Returns the state before the first task."""
     return RunState(
         stage=0,
         steps=0,
@@ -62,13 +63,13 @@ def start(plan: Plan) -> RunState:
 
 
 def interactions(standing: RunState, plan: Plan) -> int:
-    """Of each member, in all tasks together."""
+    """Returns the training interactions of each member, in all tasks."""
     steps = min(standing.steps, plan.budget.steps)
     return standing.stage * plan.interactions + steps * plan.settings.envs
 
 
 def save(folder: Path, standing: RunState) -> None:
-    """Writes a checkpoint, and drops those from within a task that it outdates."""
+    """Writes a checkpoint, and deletes older ones from the middle of a task."""
     items: dict[str, Any] = {
         "counts": {"active": standing.active, "selection": standing.selection}
     }
@@ -91,7 +92,7 @@ def save(folder: Path, standing: RunState) -> None:
 
 
 def kept(folder: Path, stage: int | None) -> Path:
-    """The checkpoint kept after a stage, or after the latest one.
+    """Returns the checkpoint after a stage, by default the latest stage.
 
     Raises:
       UserError: there is none.
@@ -109,18 +110,18 @@ def kept(folder: Path, stage: int | None) -> Path:
 
 
 def finished(folder: Path, stage: int) -> bool:
-    """Whether what is kept after a stage is there."""
+    """Whether the checkpoint after a stage exists."""
     return (folder / _FOLDER / _name(stage + 1)).exists()
 
 
 def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | None:
-    """The newest standing whose checkpoint and rows are whole, None if there is none.
+    """Returns the newest state whose checkpoint and rows are complete, or None.
 
-    What the run's tables hold beyond it is cut off.
+    Removes rows of the tables that were written after this checkpoint.
 
     Args:
-      folder: of the run.
-      plan: of the run.
+      folder: folder of the run.
+      plan: plan of the run.
       say: is told about every checkpoint that cannot be used.
     """
     for path in checkpoint.available(folder / _FOLDER):
@@ -189,7 +190,7 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
     """The policies kept after a stage, or after the latest one.
 
     Args:
-      folder: of the run.
+      folder: folder of the run.
       stage: of its sequence, or None.
       like: params and method_state, `[members]`, as shapes.
 
@@ -205,8 +206,7 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
         return checkpoint.load(path, {"policy": like})[0]["policy"]
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(
-            f"{error}; delete it and what is newer beside it, and --resume trains "
-            "that again"
+            f"{error}; delete it and newer checkpoints, and --resume trains that again"
         ) from error
 
 
@@ -235,7 +235,7 @@ def between(stage: int, items: dict[str, Any], plan: Plan) -> RunState:
     return RunState(
         stage=stage,
         steps=0,
-        # The rest of a learner starts anew with the next task.
+        # The rest of a learner is reset at the start of the next task.
         learner=plan.program.init(plan.stacked)._replace(
             params=params, method_state=method_state, critic=items["critic"]
         ),

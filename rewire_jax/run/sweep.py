@@ -2,12 +2,12 @@
 
 settings.json        what all members share, the axes, the members, provenance
 task-000/            the first task
-  batches.json       which members are trained on it side by side
+  batches.json       which members are trained on it together
   batch-000/         their tables and checkpoints, as a run's (see `run_folder`)
 
-Each task is trained by all members, in batches that fit the memory, before the next
-one begins; so the worst can be left out of the next (successive halving, Jamieson and
-Talwalkar 2016).
+All members are trained on a task, in batches that fit the memory, before the next task
+starts. So the worst members can be dropped between tasks (successive halving, Jamieson
+and Talwalkar 2016).
 """
 
 import math
@@ -46,18 +46,18 @@ _POLL = 1.0  # seconds, to wait for another process
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """A sweep, prepared.
+    """A sweep, ready to run.
 
     Attributes:
-      folder: of the sweep.
-      settings: what all members share; at the axes, the first configuration's.
-      scenario: of all members.
-      members: all members, the seeds of a configuration side by side.
-      axes: names of the settings in which they differ.
-      halving: of the configurations, one in this many goes on to the next task.
-      most: members trained side by side at most.
-      log: where scalars go, too, as `train` has it.
-      progress: makes the display.
+      folder: folder of the sweep.
+      settings: settings of the first configuration; others differ only in the axes.
+      scenario: scenario of all members.
+      members: all members; the seeds of a configuration are consecutive.
+      axes: names of the settings in which members differ.
+      halving: one in this many configurations continues with the next task.
+      most: largest number of members trained at the same time.
+      log: loggers that also get the scalars, see `train`.
+      progress: class of the display.
     """
 
     folder: Path
@@ -74,7 +74,7 @@ class Sweep:
         """Trains the batches that no other process trains, until all are finished.
 
         Raises:
-          Stopped: interrupted; what is finished is saved.
+          Stopped: interrupted; finished steps are saved.
         """
         try:
             for stage in range(self.settings.tasks):
@@ -87,12 +87,12 @@ class Sweep:
                         time.sleep(_POLL)
         except (Stopped, KeyboardInterrupt):
             raise Stopped(
-                "stopped; what was trained is saved: give the same command with "
-                f"--resume, for {self.folder}"
+                f"stopped and saved in {self.folder}: to continue, give the "
+                "same command with --resume"
             ) from None
 
     def batches(self, stage: int) -> tuple[list[list[int]], int]:
-        """Numbers of the members trained on a task, by batch, and a batch's slots."""
+        """Returns the members of each batch on a task, and the size of a batch."""
         path = batches_of(self.folder, stage)
         while not path.exists():
             with run_folder.claimed(path.parent) as ours:
@@ -106,7 +106,7 @@ class Sweep:
         return read_batches(path)
 
     def survivors(self, stage: int) -> list[int]:
-        """The members that are to be trained on a task."""
+        """Returns the members to train on a task."""
         if stage == 0:
             return [member.number for member in self.members]
         before = [n for batch in self.batches(stage - 1)[0] for n in batch]
@@ -121,9 +121,9 @@ class Sweep:
         return [n for i in sorted(kept) for n in before[i * seeds : (i + 1) * seeds]]
 
     def share(self, members: int) -> tuple[int, int]:
-        """Places in a batch and how many batches, for so many members."""
+        """Returns the size of a batch and the number of batches."""
         devices = jax.local_device_count()
-        # In whole rounds of the devices, as slots are.
+        # A batch is divided equally between the devices.
         most = max(self.most - self.most % devices, min(self.most, devices))
         count = math.ceil(members / most)
         size = math.ceil(members / count)
@@ -132,14 +132,14 @@ class Sweep:
         return size, math.ceil(members / size)
 
     def unfinished(self, stage: int, batches: int) -> list[int]:
-        """A task's batches that are still to be trained."""
+        """Returns the batches of a task that are not finished."""
         folders = [batch(self.folder, stage, number) for number in range(batches)]
         return [n for n, f in enumerate(folders) if not run_state.finished(f, stage)]
 
     def claim(
         self, stage: int, number: int, batches: list[list[int]], num_slots: int
     ) -> bool:
-        """Trains a batch on a task, unless another process does; whether it did."""
+        """Trains a batch on a task unless another process does; returns whether."""
         folder = batch(self.folder, stage, number)
         with run_folder.claimed(folder) as ours:
             if ours and not run_state.finished(folder, stage):
@@ -147,14 +147,14 @@ class Sweep:
         return ours
 
     def plan(self, numbers: Sequence[int], num_slots: int) -> Plan:
-        """The plan of a batch."""
+        """Returns the plan of a batch."""
         members = [self.members[number] for number in numbers]
         return prepare(self.settings, self.scenario, members, num_slots)
 
     def train(
         self, stage: int, number: int, batches: list[list[int]], num_slots: int
     ) -> None:
-        """Trains a batch on a task, or what is left of that."""
+        """Trains a batch on a task, or the rest of it after a stop."""
         folder = batch(self.folder, stage, number)
         plan = self.plan(batches[number], num_slots)
         label = f"{self.settings.method} sweep on {self.settings.scenario}"
@@ -176,27 +176,27 @@ class Sweep:
                 return run.start(now)
 
             with interruptible(run.interrupt, folder, display.message):
-                # Where it stands is not kept here: what was learned before would be.
+                # No variable holds the state, so that its memory can be freed.
                 run.task(start(), self.ahead(stage, number, len(batches)))
             if run.interrupt.stopping:  # since the last chunk
                 raise Stopped
 
     def subject(self, member: Member) -> loggers.Subject:
-        """Whose log a member's is, from one task to the next."""
+        """Returns the log of a member; it is the same for all tasks."""
         values = {name: read(member, name) for name in self.axes}
         facts = [f"{name}={short(value)}" for name, value in values.items()]
         facts = [f"member-{member.number:03d}", *facts, f"seed={member.seed}"]
         return loggers.subject(self.folder, self.settings, member, ",".join(facts))
 
     def ahead(self, stage: int, number: int, batches: int) -> int:
-        """Batches still to be trained after one, if no other process trains any."""
+        """Returns how many batches remain after this one, if no other process helps."""
         left = batches - number - 1
         for later in range(1, self.settings.tasks - stage):
             left += math.ceil(batches / self.halving**later)
         return left
 
     def gather(self, stage: int, plan: Plan) -> RunState:
-        """A batch's members as they were after the task before, wherever that was."""
+        """Returns a batch's members as saved after the previous task, in any batch."""
         found: dict[int, Any] = {}
         wanted = {member.number for member in plan.members}
         batches, num_slots = self.batches(stage - 1)
@@ -209,7 +209,7 @@ class Sweep:
                 items = run_state.read_kept(folder, stage - 1, made)
             except checkpoint.CheckpointError as error:
                 raise UserError(
-                    f"{error}; delete {folder} and resume to train it anew"
+                    f"{error}; delete {folder} and resume to train this batch again"
                 ) from error
             for place, name in enumerate(numbers):
                 found[name] = jax.tree.map(lambda leaf, p=place: leaf[p], items)
@@ -236,31 +236,33 @@ def sweep(
 ) -> Path:
     """Trains every configuration with every seed as one population.
 
-    Several processes can share a sweep in one folder: one starts it, the others call
-    this with the same arguments and `join`. Each trains a batch that no other process
-    trains. If a process ends early, the others finish its batch.
+    Several processes can share a sweep in one folder. One starts it; the others call
+    this function with the same arguments and `join`. Each trains a batch that no other
+    process trains. If a process ends early, the others finish its batch.
 
     Args:
-      settings: what the members share; `seeds` is of each configuration.
-      out: folder of the sweep, new or empty, or with `resume` an unfinished one.
-      axes: names of traced settings and their values, of which every combination is
-        a configuration; `modes` is K.
-      configurations: these instead, each with values for the same settings.
-      random: so many random configurations instead; the axes' values are ranges.
-      halving: after each task the best 1 / `halving` of the configurations go on, by
-        episodes apart from those that are reported; 1 for all.
-      members_per_batch: trained side by side at most; 0 for as many as fit.
-      scenario: one of your own; otherwise made from the settings.
-      resume: go on with what is not finished.
-      join: help the process that started the sweep in this folder, or resumed it.
-      log: where scalars go, too, as `train` has it.
-      progress: makes the display.
+      settings: settings that all members share; each configuration has `seeds` seeds.
+      out: folder of the sweep, new or empty; with `resume`, an unfinished sweep.
+      axes: names of traced settings and their values; every combination is a
+        configuration. `modes` is K.
+      configurations: used instead of `axes`; values of the same settings in each.
+      random: number of random configurations, used instead of all combinations. An
+        axis is then a range, or one fixed value.
+      halving: after each task, the best 1 / `halving` of the configurations continue,
+        chosen by other episodes than the reported ones; 1 for all.
+      members_per_batch: largest number of members trained at the same time; 0 for as
+        many as fit.
+      scenario: your own scenario; if None, the settings name it.
+      resume: continue an unfinished sweep.
+      join: help the process that started or resumed the sweep in this folder.
+      log: loggers that also get the scalars, see `train`.
+      progress: class of the display.
 
     Returns:
       The folder; see this module for what it holds, and `write_report`.
 
     Raises:
-      UserError: settings that make no sense, a folder that does not fit, a full disk.
+      UserError: invalid settings, a folder of another run, or a full disk.
       Stopped: interrupted, and saved.
     """
     folder = Path(out)
@@ -289,8 +291,8 @@ def sweep(
         saved = run_folder.read_header(folder, "sweep")
         require(
             all(saved[name] == header[name] for name in ("members", "halving")),
-            f"{folder} was started with other axes, seeds or halving: give the same "
-            "again or name another --out",
+            f"{folder} was started with other axes, seeds or halving: repeat them or "
+            "use another --out",
         )
         need = memory_estimate.need(plan)
         made = Sweep(
@@ -318,15 +320,14 @@ def _header(
     axes: Mapping[str, Any],
     **asked: int,
 ) -> dict[str, Any]:
-    """What the sweep's settings.json holds.
+    """Returns the contents of the sweep's settings.json.
 
     Args:
-      plan: of any of the members.
-      members: all of them.
-      names: of the settings in which they differ.
-      axes: names of settings and their values, as given; none for those that the
-        members have.
-      asked: what else was asked for.
+      plan: plan of any member.
+      members: all members.
+      names: names of the settings in which members differ.
+      axes: names and values of the axes as given; if empty, the members' values.
+      asked: other arguments of the sweep.
     """
     told = [
         {

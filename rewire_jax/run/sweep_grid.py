@@ -44,14 +44,14 @@ def draws(
     """Random configurations, the same for the same seed in the settings.
 
     Args:
-      axes: name and range (low, high) of each setting, or one value that is kept.
-        Whole numbers are drawn from low to high; others log-uniformly where the range
-        lies above 0 and spans a factor of 10, else uniformly.
-      number: of configurations.
-      settings: tell which settings are whole numbers.
+      axes: name and range (low, high) of each setting, or one fixed value. Whole-number
+        settings get whole numbers, others log-uniform values if the range is positive
+        and spans a factor of 10 or more, else uniform values.
+      number: number of configurations.
+      settings: settings of the sweep; they determine the seed and the types.
 
     Raises:
-      UserError: a range that is none, or an unknown setting.
+      UserError: an invalid range, or an unknown setting.
     """
     kinds = names(settings)
     for name, values in axes.items():
@@ -80,7 +80,7 @@ def configure(settings: Settings, values: Mapping[str, float]) -> Settings:
     """The settings with these values.
 
     Raises:
-      UserError: an unknown setting, or a value that makes no sense.
+      UserError: an unknown setting, or an invalid value.
     """
     kinds = names(settings)
     sac: dict[str, Any] = {}

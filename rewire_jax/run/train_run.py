@@ -36,7 +36,7 @@ from rewire_jax.training.sac import TrainState
 
 
 class Run:
-    """A run in its folder. Holds paths and compiled functions, no learning state."""
+    """A run in its folder; stores paths and compiled functions, no learning state."""
 
     def __init__(
         self,
@@ -49,12 +49,12 @@ class Run:
         """See `train`.
 
         Args:
-          plan: of the run.
-          folder: for its tables and checkpoints; it must exist.
+          plan: plan of the run.
+          folder: folder for tables and checkpoints; it must exist.
           progress: the display.
-          logs: its scalars, too; opened by `start`.
-          choosing: also plays episodes by which members can be chosen, apart from
-            those that are reported.
+          logs: loggers of scalars; `start` opens them.
+          choosing: whether each evaluation also plays other episodes, by which a sweep
+            chooses between members.
         """
         self.plan = plan
         self.folder = folder
@@ -64,10 +64,10 @@ class Run:
         self.interrupt = Interrupt()
 
     def start(self, now: RunState | None = None) -> RunState:
-        """The beginning of the run, after the evaluation of untrained policies.
+        """Starts the run: evaluates the untrained policies.
 
         Args:
-          now: where it stands already, if it does.
+          now: state of a run that is resumed; it is returned as it is.
         """
         if now is not None:
             self.logs.open(run_state.interactions(now, self.plan) + 1)
@@ -78,11 +78,11 @@ class Run:
         return now
 
     def task(self, now: RunState, ahead: int) -> RunState:
-        """Trains what is left of a task, and concludes it.
+        """Trains the rest of a task, evaluates and saves.
 
         Args:
-          now: where the run stands.
-          ahead: populations that are still to be trained on a task after this.
+          now: state of the run.
+          ahead: see `Recorder.ahead`.
 
         Raises:
           Stopped: interrupted, and saved.
@@ -103,7 +103,7 @@ class Run:
                     f"stopped and saved: continue with --resume --out {self.folder}"
                 )
         assert now.state is not None
-        # The replay buffer goes before policies are rolled out.
+        # The replay buffer is freed before policies are evaluated.
         now = now._replace(learner=now.state.learner, state=None)
         now = self.conclude(now, task)
         returns = self.evaluate(now, stage)[:, stage]
@@ -124,11 +124,11 @@ class Run:
     def select(
         self, now: RunState, learner: TrainState, task: Task, phase: int
     ) -> tuple[jax.Array | None, jax.Array]:
-        """Rolls out the candidates at the start (phase 0) or end (1) of a task.
+        """Evaluates the candidates at the start (phase 0) or end (1) of a task.
 
         Returns:
-          Their mean returns `[members, candidates]`, None where nothing is to be
-          chosen, and the interactions spent on candidates so far, `[members]`.
+          Mean returns `[members, candidates]` (None if the method chooses nothing), and
+          the interactions spent on candidates so far, `[members]`.
         """
         program, rows = self.plan.program, self.plan.budget.rows
         if program.candidates is None or not rows:
@@ -136,13 +136,13 @@ class Run:
         candidates = program.candidates(self.plan.stacked, learner, now.stage)
         mesh = self.plan.mesh
         if not candidates.valid.any():
-            # What is given to the end of a task is of one type, played or not.
+            # `end_task` gets the same types as after an evaluation: it is traced once.
             return population.place(
                 (jnp.zeros(candidates.valid.shape), now.selection), mesh
             )
         result = program.trial(
             jax.tree.map(lambda leaf: np.stack([leaf] * rows), task),
-            # Placed as all policies are: else the function is traced once more.
+            # Without `place`, the function would be traced once more.
             population.place(_fill(candidates.policies, rows), mesh),
             self.keys(Stream.SELECTION, 2 * now.stage + phase, rows),
             self.plan.settings.selection_episodes,
@@ -150,7 +150,7 @@ class Run:
         return population.place(_judge(result, candidates.valid, now.selection), mesh)
 
     def keys(self, stream: int, number: int, rows: int) -> jax.Array:
-        """Random keys `[members, rows]` that depend on nothing but the arguments."""
+        """Returns keys `[members, rows]` that depend only on seeds and arguments."""
         return _make_keys(self.plan.stacked.keys, stream, number, rows)
 
     def chunk(self, now: RunState, task: Task) -> RunState:
@@ -194,9 +194,9 @@ class Run:
         return now
 
     def due(self, done: int, end: int, unit: int) -> int:
-        """Steps until the next progress report, or until the end.
+        """Returns the steps until the next progress report, or until the end.
 
-        `unit` is that of steps between two times of updates.
+        `unit` is the number of steps between two rounds of updates.
         """
         settings = self.plan.settings
         times = settings.report_every // (settings.envs * settings.update_every)
@@ -206,13 +206,13 @@ class Run:
     def advance(
         self, now: RunState, state: train_loop.RunnerState, steps: int
     ) -> RunState:
-        """The run after these steps; tells of members that were frozen in them."""
+        """Returns the state after these steps; reports members that became inactive."""
         active = np.array(state.active)
         self.recorder.frozen(now, active)
         return now._replace(steps=now.steps + steps, state=state, active=active)
 
     def save(self, now: RunState, before: int) -> None:
-        """Writes a checkpoint from within a task if one is due after `before`."""
+        """Writes a checkpoint in the middle of a task if one is due after `before`."""
         settings = self.plan.settings
         interval = max(settings.checkpoint_every // settings.envs, 1)
         due = settings.checkpoint_every and now.steps // interval > before // interval
@@ -221,7 +221,7 @@ class Run:
             run_state.save(self.folder, now)
 
     def conclude(self, now: RunState, task: Task) -> RunState:
-        """Lets the method choose among its candidates, and end the task."""
+        """Evaluates the candidates, then lets the method end the task."""
         program, members, stage = self.plan.program, self.plan.stacked, now.stage
         learner = now.learner
         assert learner is not None
@@ -284,21 +284,22 @@ def train(
     log: Sequence[str] = (),
     progress: Callable[..., Progress] = Progress,
 ) -> Path:
-    """Learns a sequence of tasks; see `run_folder` for what it writes.
+    """Trains on a sequence of tasks; `run_folder` describes the files it writes.
 
     Args:
-      settings: of the run, for instance from `preset`.
-      out: folder of the run, new or empty, or with `resume` an unfinished run's.
-      scenario: one of your own; otherwise made from the settings.
-      resume: continue from the newest checkpoint that is whole.
-      log: where scalars go, too, a log for each member: "tensorboard", "wandb".
-      progress: makes the display.
+      settings: settings of the run, for instance from `preset`.
+      out: folder of the run, new or empty; with `resume`, folder of an unfinished run.
+      scenario: your own scenario; if None, the settings name it.
+      resume: continue from the newest complete checkpoint.
+      log: loggers that also get the scalars, a log for each member: "tensorboard",
+        "wandb".
+      progress: class of the display.
 
     Returns:
       The folder.
 
     Raises:
-      UserError: wrong settings, a folder that does not fit, a full disk.
+      UserError: invalid settings, a folder of another run, or a full disk.
       Stopped: interrupted, and saved.
     """
     folder = Path(out)

@@ -1,7 +1,7 @@
 """Checkpoints: folders of arrays that are complete or not there.
 
 A checkpoint holds named items, each a pytree of arrays in an Orbax folder of its
-own, so that a policy is read without the replay buffer beside it. `manifest.json`
+own, so that a policy is read without the replay buffer. `manifest.json`
 lists the leaves of each item and the size and SHA-256 of each file. All is written
 under a temporary name and renamed when it is on disk: give checkpoints names of
 their own, in the order of time. A folder of checkpoints has one writer at a time.
@@ -47,7 +47,7 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
     """Writes a checkpoint; it is complete or not there.
 
     Args:
-      path: the folder to make; one that stands there gives way at the last moment.
+      path: the folder to create; it replaces an existing folder at the last moment.
       items: pytrees of arrays, by the name under which `load` finds them.
       metadata: what JSON can hold.
 
@@ -231,7 +231,7 @@ def _check_sizes(found: Any, like: Any) -> None:
 
 @contextmanager
 def _orbax() -> Iterator[tuple[Any, Any]]:
-    """Orbax, and a synchronous checkpointer that reports by exceptions alone."""
+    """Orbax, and a synchronous checkpointer that reports only by exceptions."""
     # Here, because it takes long to import.
     import orbax.checkpoint as ocp
 
@@ -277,7 +277,7 @@ def _foreign(path: Path, content: Any, why: str) -> ForeignError:
     written = known.get("version", "of an unknown version")
     return ForeignError(
         f"checkpoint {path} does not fit rewire_jax {__version__}: {why}; it was "
-        f"written by rewire_jax {written}: use that, or start anew in another folder"
+        f"written by rewire_jax {written}: use that version, or train in another folder"
     )
 
 

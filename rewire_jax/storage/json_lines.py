@@ -96,5 +96,5 @@ def index(row: dict[str, Any], name: str, low: int, high: int) -> int:
 
 
 def number(value: float | None) -> float:
-    """A number of JSON, whose null stands for NaN."""
+    """A number of JSON, where null means NaN."""
     return np.nan if value is None else float(value)

@@ -33,7 +33,7 @@ class Results:
     """What the header of a run or a sweep says.
 
     Attributes:
-        folder: of the run or sweep.
+        folder: folder of the run or sweep.
         settings: the resolved settings saved with it.
         tasks: names of the whole sequence, T of them.
         provenance: command, commit, versions, device and start time.
@@ -170,7 +170,7 @@ def read_timing(path: Path, tasks: int, members: int, needed: bool) -> Timing:
             interactions += x - (last[1] if last[0] == stage else 0)
             seconds += took
         last = (stage, x)
-    # A run that was stopped goes on in another process, which begins to count anew.
+    # A resumed run continues in another process, which counts from 0 again.
     held = ((where, most) for _, _, where, most in rows.values())
     where, most = max(held, key=lambda each: each[1], default=("", 0))
     return Timing(

@@ -5,7 +5,7 @@ results.jsonl     a row for each member and task of an evaluation
 training.jsonl    a row for each progress report and member
 timing.jsonl      a row for each progress report: wall-clock seconds
 checkpoints/      `task-003` after three tasks, `task-003-step-…` in the next
-.lock             is locked by the process that trains
+.lock             locked by the training process
 """
 
 import contextlib
@@ -40,10 +40,10 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "mujoco", "orbax-checkpoi
 
 
 def provenance() -> dict[str, Any]:
-    """What a result must be traced back by: command, commit, versions, device."""
+    """Returns the origin of a result: command, commit, versions, device."""
     root = Path(__file__).parents[2]
     commit = "unknown"
-    # Installed, it may stand in the repository of something else.
+    # An installed package may be inside another repository.
     if (root / ".git").exists():
         with contextlib.suppress(OSError, subprocess.CalledProcessError):
             commit = subprocess.run(
@@ -68,12 +68,12 @@ def provenance() -> dict[str, Any]:
 def held(
     folder: Path, header: Mapping[str, Any] | None, kind: str = "run"
 ) -> Iterator[None]:
-    """Keeps the folder of a run from all other processes as long as this lasts.
+    """Locks the folder of a run against other processes, within a `with` block.
 
     Args:
-      folder: of the run or sweep.
-      header: of a new one; None to go on with the one that is there.
-      kind: of the one that is there.
+      folder: folder of the run or sweep.
+      header: header of a new run; None to continue the existing one.
+      kind: kind of the existing folder, "run" or "sweep".
 
     Raises:
       UserError: the folder holds something else, or cannot be written, or another
@@ -101,9 +101,9 @@ def held(
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[bool]:
-    """Locks a folder, made if it is not there, unless another process has.
+    """Makes a folder if necessary and locks it, unless another process has.
 
-    Yields whether this process has it.
+    Yields whether this process has the lock.
 
     Raises:
       UserError: the folder cannot be written.
@@ -120,7 +120,7 @@ def claimed(folder: Path) -> Iterator[bool]:
 def _lock(folder: Path) -> FileLock | None:
     """Locks a folder; None if another process has.
 
-    The system unlocks it when the process ends, however that is.
+    The system unlocks it when the process ends in any way.
     """
     file = folder / _LOCK
     lock = FileLock(file, timeout=0)
@@ -138,7 +138,7 @@ def _lock(folder: Path) -> FileLock | None:
 
 
 def _check_vacant(folder: Path) -> None:
-    """Raises `UserError` if a folder holds more than a start that was cut short."""
+    """Raises `UserError` if a folder contains more than an interrupted start."""
     with writing(folder):
         others = folder.exists() and (
             not folder.is_dir()
@@ -153,13 +153,13 @@ def _check_vacant(folder: Path) -> None:
 
 
 def make(folder: Path) -> None:
-    """Makes a folder that may be there; `UserError` if it cannot be made."""
+    """Creates a folder if it does not exist; `UserError` if this fails."""
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes JSON, all of it or nothing; `UserError` if it cannot be written."""
+    """Writes JSON completely or not at all; `UserError` if this fails."""
     temporary = path.with_name(f".{path.name}")
     try:
         with writing(path):
@@ -211,7 +211,7 @@ def telling_version(folder: Path, header: Any) -> Iterator[None]:
             written = "of an unknown version"
         raise UserError(
             f"{folder} does not fit rewire_jax {__version__}: {error}; it was written "
-            f"by rewire_jax {written}: use that, or start anew in another folder"
+            f"by rewire_jax {written}: use that version, or train in another folder"
         ) from error
 
 

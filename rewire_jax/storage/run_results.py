@@ -76,7 +76,7 @@ class RunData(Results):
 
 
 def read_run(folder: str | Path, success: Success = "any") -> RunData:
-    """Reads a run from its folder alone.
+    """Reads a run, only from its folder.
 
     The last line of a table may have been cut by a crash and is then ignored. A row
     written again by a resumed run replaces the earlier one.
@@ -127,7 +127,7 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
 
     Args:
         run: as read.
-        name: of the value.
+        name: name of the value.
 
     Raises:
         UserError: the run does not report it, or its file is damaged.

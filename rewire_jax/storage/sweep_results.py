@@ -33,7 +33,7 @@ class SweepData(Results):
 
     Attributes:
         random: how many configurations were drawn; 0 for a grid or a list.
-        halving: of this many configurations, one goes on to the next task.
+        halving: one in this many configurations continues with the next task.
         axes: values of the members by name, `[M]` each.
         configurations: number of each member's configuration, `[M]`.
         seeds: `[M]`.
@@ -46,7 +46,7 @@ class SweepData(Results):
         model_size: numbers stored ÷ those of one policy, `[M, T]`, NaN where missing.
         training: interactions spent on training since the beginning, in the same form.
         selection: the same of choosing and rolling back.
-        hours: of all members together, see `Timing`.
+        hours: hours of all members together, see `Timing`.
     """
 
     random: int
@@ -89,7 +89,7 @@ class SweepData(Results):
 
 
 def read_sweep(folder: str | Path) -> SweepData:
-    """Reads a sweep from its folder alone.
+    """Reads a sweep, only from its folder.
 
     As in a run's tables, a last line that was cut is ignored, and a row written again
     replaces the earlier one.
@@ -159,7 +159,7 @@ def _design(head: Results) -> dict[str, Any]:
 
 
 def batches_of(folder: Path, stage: int) -> Path:
-    """The file that says which members are trained on a task side by side."""
+    """The file that says which members are trained together on a task."""
     return folder / f"task-{stage:03d}" / "batches.json"
 
 

@@ -19,7 +19,7 @@ def colored(
       key: a random key.
       color: 0 is white, 1 pink, 2 red.
       length: steps in time, at least 1.
-      shape: of the array of sequences.
+      shape: shape of the array of sequences.
     """
     power = np.maximum(np.abs(np.fft.fftfreq(length)), 1 / length) ** -color
     gain = np.sqrt(power / power.mean())[: length // 2 + 1]

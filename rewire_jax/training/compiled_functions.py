@@ -120,7 +120,7 @@ def _loop(
         require(
             method.candidate_score == "episode",
             "--candidate-score since_reset: environments that are stepped on the host "
-            "are scored by whole episodes alone",
+            "are scored only by whole episodes",
         )
         loop = host_train_loop.loop(of, method.act, mesh, traces)
         return loop, loop.rollout

@@ -37,7 +37,7 @@ def sample_noise(
     random: int,
     sequence: jax.Array | None,
 ) -> ActionNoise:
-    """The random numbers of one step.
+    """Returns the random numbers of one step.
 
     Args:
       key: a random key.
@@ -68,14 +68,14 @@ def explore(
     steps: jax.Array,
     method: Method,
 ) -> tuple[jax.Array, Any]:
-    """The exploring actions of all environments of a member.
+    """Returns the exploring actions of all environments of a member.
 
     Args:
       draw: the random numbers.
       acting: the method's parameters and state.
-      extras: the method's, of the previous step.
+      extras: the method's extras of the previous step.
       observation: `[envs, observations]`.
-      steps: `[envs]` int, of the running episodes.
+      steps: `[envs]` int, steps made in the running episodes.
       method: the method.
 
     Returns:
@@ -97,14 +97,14 @@ def sample_colored(
     length: int,
     settings: SacSettings,
 ) -> jax.Array:
-    """The coloured noise `[length, *size]` of the episode that contains a step.
+    """Returns the coloured noise `[length, *size]` of the episode with a step.
 
     Args:
-      key: the task's, as in `train`.
-      time: `[]` int, of the step.
-      size: of the noise in a step.
-      length: of an episode.
-      settings: SAC's.
+      key: the member's key for this task.
+      time: `[]` int, the step.
+      size: shape of the noise in a step.
+      length: steps of an episode.
+      settings: SAC's settings.
     """
     noise_key = random_keys.of_step(key, time - time % length).noise
     return colored_noise.colored(noise_key, settings.noise_color, length, size)

@@ -1,12 +1,11 @@
-"""Episodes of simulators on the host: begun, advanced, and taken up again.
+"""Episodes of simulators on the host: started, stepped, and restored.
 
-They look like those of compiled environments, `[members, envs]` on the host. What is in
-the middle of an episode is known by its seed and the actions since, which lie in the
-replay buffer: where the simulators are not where a state says, they are brought there
-by playing these again.
+Their records are those of compiled environments, `[members, envs]` on the host. The
+seed of an episode and its actions determine the state of a simulator. The actions are
+in the replay buffer. So a resumed run restores a simulator by replaying the actions.
 """
 
-# NumPy's arrays stand where the records below have JAX's.
+# The records below have JAX arrays as types; here they contain NumPy arrays.
 # mypy: disable-error-code="arg-type"
 
 from typing import Any
@@ -25,7 +24,7 @@ Array = NDArray[Any]
 
 
 def seeds(roots: Array, number: Array) -> Array:
-    """Seeds `[members, envs]` of each environment's so many-th episode."""
+    """Returns seeds `[members, envs]` for episode `number` of each environment."""
     return np.array(
         [
             [draw_seed(*root, env, of) for env, of in enumerate(row)]
@@ -37,12 +36,12 @@ def seeds(roots: Array, number: Array) -> Array:
 def begin(environment: HostEnvironment, number: Array, observation: Array) -> Any:
     """Environments `[members, envs]` at the start of an episode.
 
-    An environment's inner state is the number of its episode. Unlike compiled ones it
-    keeps no start: the next episode has one of its own.
+    An environment's inner state is the number of its episode. Unlike a compiled
+    environment, it stores no initial state, because each episode has a new one.
 
     Args:
-      environment: theirs.
-      number: `[members, envs]` int32, of the episodes.
+      environment: the environment.
+      number: `[members, envs]` int32, numbers of the episodes.
       observation: `[members, envs, observations]`.
     """
     shape = number.shape
@@ -64,11 +63,11 @@ def advance(
     """Steps all environments; ended episodes are followed by new ones.
 
     Args:
-      environment: theirs.
-      lanes: where they are, as the episodes say.
+      environment: the environment.
+      lanes: the simulators, in the states that `episodes` describes.
       task: the current task.
-      roots: `[members, 2]` uint32, what the members' episodes are drawn from.
-      episodes: as `begin` gave them.
+      roots: `[members, 2]` uint32, from which the episodes' seeds are drawn.
+      episodes: episodes from `begin` or an earlier step.
       action: `[members, envs, actions]`.
 
     Returns:

@@ -1,6 +1,6 @@
 """Whole episodes in environments that are stepped on the host."""
 
-# NumPy's arrays stand where the records below have JAX's.
+# The records below have JAX arrays as types; here they contain NumPy arrays.
 # mypy: disable-error-code="arg-type"
 
 import functools
@@ -96,6 +96,6 @@ def _play(
             break
         observation = moment.observation
         if moment.terminal.any():
-            # What ended must be begun anew; nothing there counts any more.
+            # An ended episode must be reset before a step; its rewards no longer count.
             observation = lanes.reset(lanes.task, seeds, moment.terminal)
     return returns, lengths, any_, last

@@ -1,10 +1,9 @@
-"""The loop of a task whose environments are stepped on the host.
+"""The training loop of a task for environments that the host steps.
 
-It makes the same steps, updates and random draws as `train_loop.run_chunk`; only where
-environments are stepped differs.
+It makes the same steps, updates and random draws as `train_loop.run_chunk`.
 """
 
-# NumPy's arrays stand where the records below have JAX's.
+# The records below have JAX arrays as types; here they contain NumPy arrays.
 # mypy: disable-error-code="arg-type"
 
 import functools
@@ -46,20 +45,20 @@ class Loop(NamedTuple):
 
 
 class _Functions(NamedTuple):
-    """What is compiled; the first axis of all is `[members]`.
+    """The compiled functions; the first axis of all is `[members]`.
 
     Attributes:
-      roots: `(members, index) -> [members, 2]` uint32, what episodes are drawn from.
+      roots: `(members, index) -> [members, 2]` uint32, for the seeds of episodes.
       begin: `(members, learner, active, index, episodes) -> RunnerState`.
       draws: `(members, index, time) -> ActionNoise` `[members, every]`, of the
-        next steps: drawn for each alone, they would take half of an action's time.
+        next steps. To draw for each single step would take half of an action's time.
       act: `(members, draws, number, acting, extras, observation, steps) -> actions,
         extras`, by the draw with that number; on the CPU, where it waits for no other
         device's updates.
       store_and_update: `(members, learner, buffer, active, index, time, played) ->
         learner, buffer, active, metrics`, stores `LoopConfig.update_every` steps and
-        makes the updates that are due after them. It uses up what it is given, except
-        the learner with overlap.
+        makes the round of updates that is due after them. Its arguments are donated,
+        except the learner with overlap.
       inspect: `(members, learner, buffer, index, time) -> metrics`.
     """
 
@@ -83,7 +82,7 @@ def loop(
       of: functions of one member; its environment is stepped on the host.
       act: `Method.act`.
       mesh: the devices.
-      traces: counts those of what is called in training.
+      traces: counts the traces of functions that training calls.
     """
     environment, shape = of.environment, of.shape
     assert isinstance(environment, HostEnvironment)
@@ -132,7 +131,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         key, sac = of.keys(member, index).steps, member.sac
         sequences = None
         if sac.noise_color:
-            # All that a turn may touch, each drawn once.
+            # All sequences that these steps can need, each drawn once.
             starts = time + length * jnp.arange((shape.update_every - 2) // length + 2)
             sequences = jax.vmap(
                 lambda start: exploration.sample_colored(key, start, size, length, sac)
@@ -192,9 +191,9 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         roots=over(roots, 0, None),
         begin=over(of.start, 0, 0, 0, None, 0),
         draws=over(draws, 0, None, None),
-        # Called at each step, and so not through `shard_map`, which takes its time.
+        # Called at each step, so not through `shard_map`, which is slower.
         act=jax.jit(traces.of(act)),
-        # With overlap the former learner acts meanwhile, and must be left.
+        # With overlap, the previous learner acts meanwhile, so it is not donated.
         store_and_update=over(
             traces.of(store_and_update),
             0,
@@ -222,14 +221,14 @@ def _chunk(
     time: int,
     steps: int,
 ) -> tuple[train_loop.RunnerState, ChunkMetrics]:
-    """Collects and learns for some steps, a multiple of `LoopConfig.update_every`."""
+    """Collects and updates for a chunk, a multiple of `LoopConfig.update_every`."""
     assert steps % shape.update_every == 0
     learner, (buffer, episodes, extras), active, acting = state
     episodes = jax.tree.map(np.asarray, episodes)
     lanes = open_lanes(environment, episodes.steps.size)
     roots = np.asarray(functions.roots(members, index))
     host_episodes.replay_actions(lanes, task, roots, episodes, buffer, time)
-    # What is asked for at each step must lie ready.
+    # NumPy arrays, because each step reads them.
     task = jax.tree.map(np.asarray, task)
     cpu = jax.local_devices(backend="cpu")[0]
     here = functools.partial(jax.device_put, device=cpu)
@@ -237,7 +236,7 @@ def _chunk(
     acting = here(acting or (learner.params, learner.method_state))
     learning: Any = None
     made, metrics, updates = [], [], 0
-    # JAX begins what one thread asks for in turn: actions would wait for updates.
+    # JAX runs one thread's calls in order, so actions would wait for updates.
     with ThreadPoolExecutor(1) as other:
         for start in range(time, time + steps, shape.update_every):
             played = []
@@ -293,7 +292,7 @@ def _chunk(
 
 
 def _report(made: list[Step], metrics: Any, updates: int) -> ChunkMetrics:
-    """What a chunk's steps `[members, every, envs]` each sum up to."""
+    """Returns the sums over a chunk's steps, `[members, every, envs]` each."""
     step = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *made)
     ended = step.terminal | step.truncated
 

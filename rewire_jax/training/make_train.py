@@ -1,7 +1,8 @@
 """Training as one pure function, from a key to arrays.
 
-`train` in `rewire_jax.run` makes the same steps chunk by chunk, so that it can show and
-save them; both are made of `MemberFunctions`.
+`train` in `rewire_jax.run` computes the same in chunks, so that it can print and save
+results between them. A chunk is the steps between two progress reports. Both call the
+functions in `MemberFunctions`.
 """
 
 import dataclasses
@@ -31,15 +32,19 @@ from rewire_jax.training.train_loop import ChunkMetrics
 
 
 class Curves(NamedTuple):
-    """Learning curves; a report covers `Settings.report_every` interactions.
+    """Learning curves.
+
+    A report covers `Settings.report_every` interactions, rounded down to whole rounds
+    of updates, but at least one round. The last report of a task may be shorter.
 
     Attributes:
-      interactions: `[tasks, reports]` int, of training in the task so far.
+      interactions: `[tasks, reports]` int, training interactions in the task so far.
       returns: `[tasks, reports]`, mean return of the training episodes that ended;
-        NaN where none did.
+        NaN if no episode ended.
       rewards: `[tasks, reports]`, mean reward of a step.
-      metrics: `[tasks, reports]` by name: of the updates their mean, of the method's
-        own the latest.
+      metrics: `[tasks, reports]` by name. Metrics of updates are means over the rounds
+        of updates, each round represented by its last update. Metrics of
+        `Method.inspect` are those at the end of the report.
     """
 
     interactions: jax.Array
@@ -49,16 +54,18 @@ class Curves(NamedTuple):
 
 
 class Trained(NamedTuple):
-    """What training came to, as arrays.
+    """The results of training.
 
     Attributes:
-      returns: `[tasks + 1, tasks]`, mean return without exploration of each task (the
-        columns) before the first task and after each.
-      success: `Success` of the same shape, shares of the episodes; `()` where none is
-        known.
-      curves: of training.
-      learned: after the last task; `make_act` acts by it.
-      active: `[]` bool, False once a value was not finite: nothing was learned since.
+      returns: `[tasks + 1, tasks]`, mean returns without exploration. The columns are
+        the evaluated tasks. The first row is from before the first task; each other
+        row is from after a task.
+      success: `Success` of the same shape, shares of the evaluation episodes; `()` if
+        the environment does not define success.
+      curves: learning curves.
+      learned: parameters and state after the last task, for `make_act`.
+      active: `[]` bool, False if a parameter became NaN or infinite. The learner was
+        not updated after that.
       selection: `[]` int, interactions spent on choosing between policies.
     """
 
@@ -71,32 +78,36 @@ class Trained(NamedTuple):
 
 
 class Train(Protocol):
-    """Learns a sequence of tasks; pure, to be jitted and vmapped.
-
-    `sac` and `options` may be given with other numbers than the settings', traced ones
-    included: `jax.vmap` over them is a sweep.
-    """
+    """Learns a sequence of tasks: a pure function, which you can jit and vmap."""
 
     def __call__(
         self, key: jax.Array, sac: SacSettings | None = None, options: Any = None
     ) -> Trained:
-        """What was learned with this key."""
+        """Trains with the random key `key`.
+
+        Args:
+          key: determines all randomness.
+          sac: SAC's settings. They may differ from the settings given to `make_train`
+            in their traced values only; `jax.vmap` over them is a sweep. None for the
+            given ones.
+          options: the method's settings, in the same way.
+        """
         ...
 
 
 def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
-    """Training as a pure function of a random key; nothing is written or shown.
+    """Returns training as a pure function of a random key.
 
-    The key `jax.random.key(seed)` gives the results of a run with this seed.
+    The function writes no files and prints nothing. The key `jax.random.key(seed)`
+    gives the results of a run with this seed.
 
     Args:
-      settings: of the run, for instance from `preset`. Its `seed`, `seeds`,
-        `checkpoint_every` and `overlap` are ignored: pass a key for each seed.
-      scenario: one of your own; otherwise made from the settings.
+      settings: settings of the run, for instance from `preset`. Its `seed`, `seeds`
+        and `checkpoint_every` are ignored: pass a key for each seed.
+      scenario: your own scenario; if None, the settings name it.
 
     Raises:
-      UserError: a setting makes no sense, or the scenario's environments are stepped
-        on the host.
+      UserError: a setting is invalid, or the host steps the scenario's environments.
     """
     settings, scenario = complete(settings, scenario)
     environment = scenario.environment
@@ -122,10 +133,17 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
 
 
 def make_act(settings: Settings, scenario: Scenario | None = None) -> Act:
-    """How to act by what `make_train` with the same arguments has learned.
+    """Returns a function that acts with what `make_train` has learned.
+
+    Args:
+      settings: the settings that `make_train` was given.
+      scenario: the scenario that `make_train` was given.
+
+    Returns:
+      `(Trained.learned, task, observation) -> action`, without exploration.
 
     Raises:
-      UserError: a setting makes no sense.
+      UserError: a setting is invalid.
     """
     settings, scenario = complete(settings, scenario)
     spec = make_functions(settings, scenario).spec
@@ -135,7 +153,7 @@ def make_act(settings: Settings, scenario: Scenario | None = None) -> Act:
 
 @dataclasses.dataclass(frozen=True)
 class _Training:
-    """A member's training; its fields are what stays the same all along."""
+    """The training of one member; its fields stay constant."""
 
     settings: Settings
     functions: MemberFunctions
@@ -153,13 +171,14 @@ class _Training:
         return self.functions.method(self.member)
 
     def run(self) -> Trained:
-        """Learns the sequence."""
+        """Learns the sequence of tasks."""
         start = (
             self.functions.init(self.member),
             jnp.asarray(True),
             jnp.zeros((), jnp.int32),
         )
-        # Stage -1 is before the first task; so evaluation is compiled but once.
+        # Stage -1 only evaluates. As a stage of the scan, it is compiled together with
+        # the other evaluations.
         stages = jnp.arange(-1, self.settings.tasks)
         end, (returns, success, curves) = jax.lax.scan(self.stage, start, stages)
         learner, active, spent = end
@@ -168,8 +187,8 @@ class _Training:
         return Trained(returns, success, curves, learned, active, spent)
 
     def stage(self, carry: Any, index: jax.Array) -> tuple[Any, Any]:
-        """Learns a task, and plays all of them."""
-        learn = jax.jit(self.task)  # so that it is traced once for both uses
+        """Learns a task (none if the index is -1), then evaluates all tasks."""
+        learn = jax.jit(self.task)  # traced only once for both uses
 
         def skip(carry, index):
             curves = jax.eval_shape(learn, carry, index)[1]
@@ -214,7 +233,7 @@ class _Training:
     def report(
         report: ChunkMetrics, steps: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Means over a chunk of so many steps, as in `Curves`."""
+        """Turns a chunk's sums over `steps` vector steps into the means of `Curves`."""
         updates = jnp.maximum(report.updates, 1.0)
         means = {name: total / updates for name, total in report.metrics.items()}
         returns = jnp.where(report.episodes, report.returns / report.episodes, jnp.nan)
@@ -228,7 +247,7 @@ class _Training:
         phase: int,
         spent: jax.Array,
     ) -> tuple[jax.Array | None, jax.Array]:
-        """As `rewire_jax.run.train_run.Run.select`."""
+        """Evaluates the candidates, as `rewire_jax.run.train_run.Run.select` does."""
         rows = self.budget.rows
         if not rows:
             return None, spent
@@ -252,7 +271,7 @@ class _Training:
     def evaluate(
         self, learner: TrainState, index: jax.Array | int
     ) -> tuple[jax.Array, Any]:
-        """Mean returns `[tasks]` after a task, and shares of success."""
+        """Returns mean returns and success rates, `[tasks]` each, after a task."""
         result = self.play(
             "episode",
             self.tasks,
@@ -271,7 +290,7 @@ class _Training:
         place: tuple[Stream, jax.Array | int],
         count: int,
     ) -> rollout.Rollout:
-        """Episodes `[rows, count]` of policies in tasks, `[rows]` each."""
+        """Plays `[rows, count]` episodes; tasks and policies are `[rows]`."""
         rows = len(jax.tree.leaves(tasks)[0])
         keys = random_keys.of_rollout(self.member.keys, *place, rows)
         policies, keys = jax.tree.map(lambda leaf: leaf[None], (policies, keys))

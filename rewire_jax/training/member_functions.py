@@ -1,4 +1,4 @@
-"""What a run does with one member, as pure functions to be vmapped and compiled."""
+"""The steps of a run for one member: pure functions, to be vmapped and compiled."""
 
 import functools
 from collections.abc import Callable
@@ -19,16 +19,16 @@ from rewire_jax.training.train_loop import CollectorState, LoopConfig, RunnerSta
 
 @dataclass(frozen=True)
 class MemberFunctions:
-    """Functions of one member; all that they hold is static.
+    """Functions of one member; their attributes are static.
 
-    `member` is an entry of `Members`, `index` the `[]` int of a task in the sequence,
-    `time` the vector steps made in it.
+    `member` is an entry of `Members`; `index` is a task's `[]` int in the sequence;
+    `time` is the number of vector steps made in this task.
 
     Attributes:
-      environment: of the scenario.
+      environment: environment of the scenario.
       make: the method's constructor.
       spec: sizes of the networks and of the sequence.
-      shape: sizes of the loop.
+      shape: sizes of the training loop.
     """
 
     environment: Environment | HostEnvironment
@@ -37,19 +37,19 @@ class MemberFunctions:
     shape: LoopConfig
 
     def method(self, member: Members) -> Method:
-        """The member's method."""
+        """Returns the member's method."""
         return self.make(self.spec, member.options)
 
     def keys(self, member: Members, index: jax.Array) -> TaskKeys:
-        """The member's keys for a task."""
+        """Returns the member's keys for a task."""
         return random_keys.of_task(member.keys, index)
 
     def start_keys(self, member: Members, index: jax.Array) -> StartKeys:
-        """The same for the task's start."""
+        """Returns the member's keys for the start of a task."""
         return random_keys.named(StartKeys, self.keys(member, index).start)
 
     def init(self, member: Members) -> TrainState:
-        """What is learned, before the first task."""
+        """Returns the learner before the first task."""
         key = jax.random.fold_in(member.keys, 0)
         return sac.init(key, self.method(member), self.spec, member.sac)
 
@@ -61,7 +61,7 @@ class MemberFunctions:
         index: jax.Array,
         task: Task,
     ) -> RunnerState:
-        """A task's start, with compiled environments."""
+        """Starts a task with compiled environments."""
         keys = jax.random.split(self.start_keys(member, index).reset, self.shape.envs)
         environment = self.environment
         assert isinstance(environment, Environment)
@@ -76,7 +76,7 @@ class MemberFunctions:
         index: jax.Array,
         episodes: rollout.Episode,
     ) -> RunnerState:
-        """A task's start, given its environments `[envs]`."""
+        """Starts a task with environments `[envs]` that were reset for it."""
         method, keys = self.method(member), self.start_keys(member, index)
         params, method_state = method.start_task(
             keys.method, learner.params, learner.method_state, index
@@ -107,7 +107,7 @@ class MemberFunctions:
         time: jax.Array,
         steps: jax.Array,
     ) -> tuple[RunnerState, train_loop.ChunkMetrics]:
-        """Collects and learns for some steps of compiled environments."""
+        """Collects and updates for a chunk, with compiled environments."""
         assert isinstance(self.environment, Environment)
         return train_loop.run_chunk(
             self.keys(member, index).steps,
@@ -124,7 +124,7 @@ class MemberFunctions:
     def consolidate(
         self, member: Members, state: RunnerState, index: jax.Array, time: jax.Array
     ) -> TrainState:
-        """The end of a task's interactions, for methods that have one."""
+        """Calls the method's `consolidate`, then resets what a task resets."""
         method = self.method(member)
         assert method.consolidate is not None
         learner, buffer = state.learner, state.collection.buffer
@@ -156,7 +156,7 @@ class MemberFunctions:
         done: jax.Array,
         steps: jax.Array,
     ) -> RunnerState:
-        """Updates from the buffer as in `steps` steps, `done` of which were before."""
+        """Makes `steps` rounds of offline updates; `done` rounds were made before."""
         method = self.method(member)
         update = functools.partial(
             train_loop.update_from_buffer,
@@ -178,7 +178,7 @@ class MemberFunctions:
     def candidates(
         self, member: Members, learner: TrainState, index: jax.Array
     ) -> Candidates:
-        """The policies among which the method chooses, if it does."""
+        """Returns the policies among which the method chooses."""
         method = self.method(member)
         assert method.candidates is not None
         return method.candidates(learner.params, learner.method_state, index)
@@ -190,14 +190,14 @@ class MemberFunctions:
         index: jax.Array,
         selection: Selection | None,
     ) -> TrainState:
-        """The end of a task."""
+        """Ends a task, with the returns of the candidates."""
         params, method_state = self.method(member).end_task(
             learner.params, learner.method_state, index, selection
         )
         return learner._replace(params=params, method_state=method_state)
 
     def policies(self, member: Members, learner: TrainState) -> Any:
-        """The policies of all tasks, `[tasks]` but for what they share."""
+        """Returns the policies of all tasks, `[tasks]` except `Shared` parts."""
         of_task = self.method(member).policy
         policy = functools.partial(of_task, learner.params, learner.method_state)
         tasks = jnp.arange(self.spec.tasks)
@@ -205,5 +205,5 @@ class MemberFunctions:
         return jax.vmap(policy, out_axes=out_axes)(tasks)
 
     def size(self, member: Members, learner: TrainState) -> jax.Array:
-        """`[]`, the numbers that the method stores."""
+        """Returns `[]`, how many numbers the method stores."""
         return self.method(member).size(learner.params, learner.method_state)

@@ -239,7 +239,7 @@ def machine_bytes(root: Path = Path("/")) -> int:
     """Bytes of the machine's memory, or of this process's share of it (cgroups).
 
     Args:
-      root: of the file system.
+      root: root of the file system.
     """
     pages, page = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
     return min([pages * page, *_limits(root)])

@@ -1,4 +1,4 @@
-"""The members of a population, configurations × seeds, and their devices."""
+"""The members of a population (configurations × seeds), and their devices."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ class Member(NamedTuple):
     """One member.
 
     Attributes:
-      number: in the run or sweep.
+      number: number in the run or sweep.
       name: a label for the user.
       seed: determines all its randomness.
       sac: SAC's settings.
@@ -38,7 +38,7 @@ class Members(NamedTuple):
     """The values that differ between members; every leaf is `[members]`.
 
     Attributes:
-      keys: random keys, made from the seed alone.
+      keys: random keys, made only from the seeds.
       sac: SAC's settings.
       options: the method's settings.
     """

@@ -28,9 +28,9 @@ class TaskKeys(NamedTuple):
 
     Attributes:
       start: see `StartKeys`.
-      steps: of its steps, each of which folds in its number.
-      consolidate: of the method, when the task's interactions are over.
-      offline: of the updates after that.
+      steps: key of the steps; each step folds its number into it.
+      consolidate: key of `Method.consolidate`.
+      offline: key of the offline updates.
     """
 
     start: jax.Array
@@ -43,10 +43,10 @@ class StartKeys(NamedTuple):
     """Keys of a task's start.
 
     Attributes:
-      method: of the method.
-      reset: of the environments.
-      critic: of fresh critics.
-      extras: of the first extras.
+      method: key of `Method.start_task`.
+      reset: key of the environments.
+      critic: key of fresh critics.
+      extras: key of the first extras.
     """
 
     method: jax.Array
@@ -60,9 +60,9 @@ class StepKeys(NamedTuple):
 
     Attributes:
       collect: see `CollectKeys`.
-      update: of the updates after it.
-      inspect: of the batch that a progress report looks at.
-      noise: of the coloured noise of the episode that begins here.
+      update: key of the updates after it.
+      inspect: key of the batch for `Method.inspect`.
+      noise: key of the coloured noise of the episode that starts here.
     """
 
     collect: jax.Array
@@ -75,11 +75,11 @@ class CollectKeys(NamedTuple):
     """Keys of a step's actions.
 
     Attributes:
-      context: of the method's context.
-      action: of the policy's noise.
-      uniform: of actions that take no heed of the policy.
-      extras: of the method's extras.
-      reset: of environments that begin an episode.
+      context: key of the method's context.
+      action: key of the policy's noise.
+      uniform: key of uniform actions.
+      extras: key of the method's extras.
+      reset: key of environments that start an episode.
     """
 
     context: jax.Array

@@ -133,7 +133,7 @@ def sample_indices(
       replay: the buffer.
       key: a random key.
       time: `[]` int, the number of time steps stored so far, at least 1.
-      shape: of the result.
+      shape: shape of the result.
     """
     rows, envs = replay.reward.shape
     filled = jnp.minimum(time, rows - 1)

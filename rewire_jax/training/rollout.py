@@ -12,11 +12,11 @@ from rewire_jax.methods.base import axes
 
 
 class Success(NamedTuple):
-    """Success by two rules, as bools or as counts.
+    """Success by two criteria, as bools or as counts.
 
     Attributes:
-      any: solved at any step of the episode so far (Continual World's rule).
-      last: solved at the latest step (the rule of the paper's authors).
+      any: solved at any step of the episode so far (as in Continual World).
+      last: solved at the latest step (as in the code of the paper's authors).
     """
 
     any: jax.Array
@@ -52,9 +52,10 @@ class Step(NamedTuple):
     Attributes:
       reward: `[]`.
       terminal: `[]` bool, ended by the task.
-      truncated: `[]` bool, ended by the time limit alone.
+      truncated: `[]` bool, ended only by the time limit.
       final_obs: `[observations]`, the observation that the step led to.
-      next_obs: `[observations]`, the same; after an ended episode, the fresh start's.
+      next_obs: `[observations]`, the same; after the end of an episode, the first
+        observation of the next one.
       score: `[]`, return of the episode so far.
       success: `Success` of `[]` bool in it; `()` if not defined.
     """
@@ -99,7 +100,7 @@ def succeed(before: Any, now: Any) -> Any:
 
 
 def begin(environment: Environment, task: Task, key: jax.Array) -> Episode:
-    """An environment at the start of an episode; errors as of `check_state`."""
+    """Resets an environment; raises the errors of `check_state`."""
     state = check_state(environment, environment.reset(task, key))
     none = no_success(environment)
     return Episode(state, state, jnp.zeros((), jnp.int32), jnp.zeros(()), none)
@@ -108,10 +109,10 @@ def begin(environment: Environment, task: Task, key: jax.Array) -> Episode:
 def advance(
     environment: Environment, task: Task, episode: Episode, action: jax.Array
 ) -> tuple[Episode, Step]:
-    """Steps one environment; an ended episode goes back to the stored start.
+    """Steps one environment; after an episode it returns to the stored initial state.
 
-    A stored start, as in brax's wrapper, avoids a reset in every step. Each environment
-    has its own start in each task.
+    A stored initial state, as in brax's wrapper, avoids a reset in every step. Each
+    environment has its own initial state in each task.
 
     Raises:
       AssertionError: see `check_state`.
@@ -155,7 +156,7 @@ def episodes(
       environment: unbatched.
       act: `(policy, observation) -> mean, log_std`.
       tasks: pytree with a leading axis `[rows]`.
-      policies: pytree with leading axes `[members, rows]`; `[members]` where `Shared`.
+      policies: pytree with leading axes `[members, rows]`; `[members]` if `Shared`.
       keys: `[members, rows]`.
       count: episodes for each member and row.
 
@@ -206,10 +207,11 @@ def since_reset(
     keys: jax.Array,
     count: int,
 ) -> Rollout:
-    """Plays one step less than an episode has, and does not stop at a terminal state.
+    """Plays `episode_length - 1` steps, and continues after a terminal state.
 
-    An ended episode goes back to its start. The return counts from the latest start, as
-    for the candidates of the authors' CSP. Arguments and result are as in `episodes`.
+    After a terminal state, the environment returns to its initial state. The score is
+    the return since the latest reset, as for the candidates in the authors' CSP.
+    Arguments and result are those of `episodes`.
     """
     over = functools.partial(_over, policies)
     steps = environment.episode_length - 1

@@ -1,4 +1,4 @@
-"""A run's plan: its settings checked, its sizes derived, its functions built."""
+"""The plan of a run: checked settings, derived sizes, compiled functions."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -21,13 +21,13 @@ from rewire_jax.training.population import Member, Members
 
 
 class Budget(NamedTuple):
-    """How long a task is, and what choosing between candidates takes.
+    """The length of a task, and the number of candidates to evaluate.
 
     Attributes:
       steps: vector steps in a task.
-      offline_steps: after these, steps that only update from the buffer.
-      rows: slots for candidates that are rolled out side by side; 0 where nothing is
-        to be chosen.
+      offline_steps: rounds of offline updates after these steps.
+      rows: number of policies that are evaluated together when the method chooses; 0
+        if it chooses nothing.
     """
 
     steps: int
@@ -36,17 +36,17 @@ class Budget(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A run, prepared: everything that does not change while it goes on.
+    """Everything that does not change during a run.
 
     Attributes:
       settings: checked and complete.
-      scenario: as it was made.
-      tasks: of the sequence that is run, stacked on a leading axis, on the host.
-      names: of these tasks.
+      scenario: the scenario.
+      tasks: tasks of the run, stacked on a leading axis, on the host.
+      names: names of these tasks.
       members: the members.
-      budget: of a task.
+      budget: budget of a task.
       spec: sizes of the networks and of the sequence.
-      stacked: the members on a leading axis; copies of the first fill it up.
+      stacked: the members on a leading axis, padded with copies of the first.
       mesh: the devices.
       program: the compiled functions.
     """
@@ -69,12 +69,12 @@ class Plan(NamedTuple):
 
     @property
     def interactions(self) -> int:
-        """Of training, in a task."""
+        """Training interactions in a task."""
         return self.budget.steps * self.settings.envs
 
 
 def make_spec(settings: Settings, environment: Environment | HostEnvironment) -> Spec:
-    """The static sizes that a method is made from."""
+    """Returns the static sizes from which a method is made."""
     return Spec(
         observations=environment.observation_size,
         actions=environment.action_size,
@@ -85,7 +85,7 @@ def make_spec(settings: Settings, environment: Environment | HostEnvironment) ->
 
 
 def base_size(spec: Spec) -> int:
-    """Numbers in one plain policy, by which model sizes are divided."""
+    """Returns the parameters of one plain policy, the unit of model sizes."""
     return count(
         jax.eval_shape(lambda: networks.init_mlp(jax.random.key(0), spec.sizes()))
     )
@@ -100,14 +100,14 @@ def prepare(
     """Checks the settings and builds what they describe; compiles nothing.
 
     Args:
-      settings: of the run.
-      scenario: one of your own; otherwise made from the settings.
-      members: the members, in place of one for each seed; their settings may differ
-        from the run's in traced numbers, and are not checked here.
-      num_slots: length of the members' axis; that of the members by default.
+      settings: settings of the run.
+      scenario: your own scenario; if None, the settings name it.
+      members: the members; by default one for each seed. Their settings may differ from
+        the settings of the run in traced values, and are not checked here.
+      num_slots: length of the members' axis; by default the number of members.
 
     Raises:
-      UserError: a setting makes no sense.
+      UserError: a setting is invalid.
     """
     settings, scenario = complete(settings, scenario)
     seeds = range(settings.seed, settings.seed + settings.seeds)
@@ -126,8 +126,8 @@ def prepare(
         spec=functions.spec,
         stacked=population.place(population.stack(filled), mesh),
         mesh=mesh,
-        # The numbers among the options do not matter here; runs that differ in them
-        # alone share the program.
+        # Traced options do not matter here: runs that differ only in them share the
+        # program.
         program=compiled_functions.build(
             functions, jax.tree.map(lambda _: 0.0, settings.options), mesh
         ),
@@ -137,10 +137,10 @@ def prepare(
 def complete(
     settings: Settings, scenario: Scenario | None = None
 ) -> tuple[Settings, Scenario]:
-    """The settings, checked and complete, and the scenario that they are for.
+    """Returns checked, complete settings and their scenario.
 
     Raises:
-      UserError: a setting makes no sense.
+      UserError: a setting is invalid.
     """
     validate(settings)
     options = find_method(settings.method).settings
@@ -164,10 +164,10 @@ def complete(
 
 
 def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
-    """What a run does with one member; nothing is computed yet.
+    """Returns the functions of one member; computes nothing.
 
     Raises:
-      UserError: the scenario cannot be run so.
+      UserError: the scenario does not fit the settings.
     """
     environment = scenario.environment
     shape = train_loop.LoopConfig(
@@ -188,18 +188,18 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
     least = min(settings.interactions // settings.envs, environment.episode_length)
     require(
         shape.transitions >= least or not hosted,
-        f"--buffer {settings.buffer} is too short for an episode, which is taken up "
-        f"again from it: give at least {least * settings.envs}",
+        f"--buffer {settings.buffer} is too short for an episode, which --resume "
+        f"replays from it: give at least {least * settings.envs}",
     )
     make = find_method(settings.method).make
     return MemberFunctions(environment, make, make_spec(settings, environment), shape)
 
 
 def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
-    """How the interactions of a task are spent.
+    """Divides the interactions of a task between training and selection.
 
     Raises:
-      UserError: they do not suffice.
+      UserError: there are too few.
     """
     environment = functions.environment
     method = functions.make(functions.spec, settings.options)
@@ -211,9 +211,8 @@ def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
         interactions -= played * environment.episode_length
         require(
             interactions >= settings.warmup + round_,
-            f"--interactions {settings.interactions} must also pay for "
-            f"{played} episodes of choosing between policies: raise it, or "
-            "lower --selection-episodes or --warmup",
+            f"--interactions {settings.interactions} must include {played} selection "
+            "episodes: raise it, or lower --selection-episodes or --warmup",
         )
     # Rows for nothing let the compiled function of an evaluation serve here, too.
     same = settings.selection_episodes == settings.eval_episodes
@@ -229,7 +228,7 @@ def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
 
 
 def _count_candidates(settings: Settings, functions: MemberFunctions) -> int:
-    """How many policies the method has rolled out at the end of a task."""
+    """Returns how many candidates the method has at the end of a task."""
     method = functions.make(functions.spec, settings.options)
     if method.candidates is None or not settings.selection_episodes:
         return 0

@@ -18,13 +18,13 @@ _STATES = {"current": 1, "both": 2}  # of a transition, in the policy's losses
 
 
 class TrainState(NamedTuple):
-    """All that learning changes.
+    """The part of a member's state that updates change.
 
     Attributes:
       params: the method's parameters.
       method_state: what the method carries from task to task.
       critic: layers of both critics, stacked on a leading axis of 2.
-      target: the same, moving slowly after them.
+      target: the same, slowly updated towards `critic`.
       log_temperature: `[]`.
       optimizers: Adam's states of policy, critics and temperature.
     """
@@ -38,7 +38,7 @@ class TrainState(NamedTuple):
 
 
 def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainState:
-    """A learner before its first task."""
+    """Returns a learner before its first task."""
     policy_key, critic_key = jax.random.split(key)
     params, method_state = method.init(policy_key)
     critic = init_critic(critic_key, spec, method.critic_extra)
@@ -49,14 +49,14 @@ def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainS
 
 
 def init_critic(key: jax.Array, spec: Spec, extra: int) -> Any:
-    """Both critics, which see `extra` numbers beside observation and action."""
+    """Returns both critics; `extra` is the input's length besides state and action."""
     inputs = spec.observations + extra + spec.actions
     sizes = [inputs, *[spec.hidden] * spec.depth, 1]
     return jax.vmap(lambda k: networks.init_mlp(k, sizes))(jax.random.split(key))
 
 
 def restart(learner: TrainState, sac: SacSettings) -> TrainState:
-    """Fresh optimisers, temperature and targets, as at the start of every task."""
+    """Resets optimisers, temperature and targets, as at the start of each task."""
     log_temperature = jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32))
     return learner._replace(
         # The targets start as copies of the critics that are kept.
@@ -71,7 +71,7 @@ def restart(learner: TrainState, sac: SacSettings) -> TrainState:
 
 
 def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
-    """Both critics' values `[2, batch]`.
+    """Returns the values of both critics, `[2, batch]`.
 
     Args:
       critic: layers of both.
@@ -84,12 +84,12 @@ def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
 
 
 class UpdateNoise(NamedTuple):
-    """What an update leaves to chance.
+    """The random draws of one update.
 
     Attributes:
-      contexts: the method's, for the critics and for the policy.
-      noise: `[2 or 3, batch, actions]`, first of the critics' actions, then of the
-        policy's: in one or both states of each transition.
+      contexts: results of `Method.context`, for the critics and for the policy.
+      noise: `[2 or 3, batch, actions]`, noise of the actions: first in the critics'
+        targets, then in the policy's losses, for one or both states of a transition.
       penalty: a key for the method's penalty.
     """
 
@@ -106,13 +106,13 @@ def sample_noise(
     method: Method,
     sac: SacSettings,
 ) -> UpdateNoise:
-    """A draw for one update.
+    """Returns the random draws of one update.
 
     Args:
       key: a random key.
-      method_state: the method's, which updates leave as it is.
-      extras: of the update's transitions.
-      size: of its actions, `batch, actions`.
+      method_state: the method's state, which updates do not change.
+      extras: extras of the update's transitions.
+      size: shape of the update's actions, `batch, actions`.
       method: the method.
       sac: SAC's settings.
     """
@@ -215,7 +215,7 @@ def _actor(learner: TrainState) -> _Actor:
 
 
 def no_metrics(update: Callable[..., tuple[Any, Metrics]], *arguments: Any) -> Metrics:
-    """Zeros in the shape of the metrics that updates give beside what they change."""
+    """Returns zeros with the shapes of the metrics that `update` returns second."""
     _, shapes = jax.eval_shape(update, *arguments)
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
@@ -227,7 +227,7 @@ def first_metrics(
     method: Method,
     sac: SacSettings,
 ) -> Metrics:
-    """What `update` is given before there was one; zeros."""
+    """Returns the metrics for the first `update` of a round: zeros."""
     policy = no_metrics(
         lambda: _update_policy(_actor(learner), learner, batch, draw, method, sac)
     )
@@ -235,7 +235,7 @@ def first_metrics(
 
 
 def _every(delay, count, change, keep, value):
-    """What becomes of a value that only every so many-th update changes."""
+    """Changes a value in every `delay`-th update only."""
     if delay == 1:  # a branch would copy
         return change(value)
     return jax.lax.cond(count % delay == 0, change, keep, value)
@@ -250,15 +250,15 @@ def update(
     method: Method,
     sac: SacSettings,
 ) -> tuple[TrainState, Metrics]:
-    """One update of the critics and, in its turn, of policy and targets.
+    """Updates the critics and, after their delays, the policy and the targets.
 
     Args:
       learner: the member's learner.
-      metrics: of the previous update, kept where this one makes none.
+      metrics: metrics of the previous update, kept if this update computes none.
       batch: `[batch, ...]` transitions.
-      draw: what is left to chance.
-      count: `[]` int, updates made before in this task; it must be shared by all
-        members of a population, so that the delayed updates stay real branches.
+      draw: the random draws.
+      count: `[]` int, updates made before in this task; shared by all members, so that
+        delayed updates stay branches (`cond`) under vmap.
       method: the method.
       sac: SAC's settings.
     """
@@ -305,14 +305,14 @@ def updates(
     method: Method,
     sac: SacSettings,
 ) -> tuple[TrainState, Metrics]:
-    """Updates one after the other, and the last one's metrics.
+    """Makes several updates; also returns the metrics of the last one.
 
     Args:
       learner: the member's learner.
       draws: `[count]` or more on every leaf.
-      batch: gives the transitions of the update with a number `[]` int.
+      batch: `number -> Batch`, the transitions of an update.
       first: `[]` int, updates made before in this task, see `update`.
-      count: `[]` int, how many to make.
+      count: `[]` int, number of updates to make.
       method: the method.
       sac: SAC's settings.
     """

@@ -1,4 +1,4 @@
-"""Playing the candidates of a method, for it to choose among them."""
+"""Evaluation of a method's candidates, so that the method can choose one."""
 
 from typing import Any
 
@@ -10,18 +10,18 @@ from rewire_jax.training.rollout import Rollout
 
 
 def fill(policies: Any, rows: int) -> Any:
-    """A member's policies `[candidates]` in so many rows, over and over."""
+    """Repeats a member's policies `[candidates]` until they fill `rows` rows."""
     return map_own(lambda leaf: leaf[jnp.arange(rows) % len(leaf)], policies)
 
 
 def judge(
     result: Rollout, valid: jax.Array, spent: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """A member's candidates by their returns, and what it took to know these.
+    """Computes the mean returns of a member's candidates and counts their steps.
 
     Args:
-      result: `[rows, episodes]`; the first rows are those of the candidates.
-      valid: `[candidates]` bool; the others are not counted.
+      result: `[rows, episodes]`; the first rows belong to the candidates.
+      valid: `[candidates]` bool; steps of other candidates are not counted.
       spent: `[]` int, interactions spent on candidates before.
 
     Returns:

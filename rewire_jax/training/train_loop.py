@@ -1,4 +1,9 @@
-"""One task's compiled loop: collect, store, update, for a whole population."""
+"""One task's compiled loop: collect, store, update.
+
+The functions are written for one member; callers vmap them. A vector step is one step
+of each environment of a member. A round is the SAC updates that follow a vector step. A
+chunk is the vector steps between two progress reports.
+"""
 
 import functools
 from typing import Any, NamedTuple
@@ -17,14 +22,13 @@ class LoopConfig(NamedTuple):
     """Static sizes of the loop.
 
     Attributes:
-      envs: parallel environments of a member. A vector step is one step of each.
+      envs: parallel environments of a member.
       updates: SAC updates in a round.
-      warmup: vector steps before the first round of updates.
-      random_steps: vector steps with uniform actions.
+      warmup: vector steps of a task before its first round of updates.
+      random_steps: vector steps with uniform actions, at the start of a task.
       transitions: vector steps that the buffer holds.
       update_every: vector steps between two rounds of updates.
-      overlap: whether environments on the host are stepped while updates are made, by
-        the policy before these updates.
+      overlap: whether environments on the host step during updates (`--overlap`).
     """
 
     envs: int
@@ -36,22 +40,22 @@ class LoopConfig(NamedTuple):
     overlap: bool = False
 
     def due(self, steps: Any) -> Any:
-        """Whether a round of updates follows so many vector steps, an int or `[]`."""
+        """Whether a round of updates follows vector step `steps`, an int or `[]`."""
         return (steps % self.update_every == 0) & (steps > self.warmup)
 
     def before(self, steps: Any) -> Any:
-        """Updates in the rounds before the one that follows so many vector steps."""
+        """Counts updates before the round that follows vector step `steps`."""
         rounds = steps // self.update_every - self.warmup // self.update_every
         return (rounds - 1) * self.updates
 
 
 class CollectorState(NamedTuple):
-    """What collecting changes within a task.
+    """The part of a member's state that collecting changes.
 
     Attributes:
       buffer: the replay buffer.
       episodes: `[envs]` environments.
-      extras: the method's, of the latest step.
+      extras: result of the latest call of `Method.extras`.
     """
 
     buffer: replay_buffer.Replay
@@ -63,11 +67,10 @@ class RunnerState(NamedTuple):
     """A member in the middle of a task.
 
     Attributes:
-      learner: all that learning changes.
-      collection: all that collecting changes.
-      active: `[]` bool; once a value is not finite the learner is updated no more.
-      acting: parameters and method's state that act next, with `LoopConfig.overlap`;
-        else `()`.
+      learner: the part that updates change.
+      collection: the part that collecting changes.
+      active: `[]` bool; if False, the learner is no longer updated.
+      acting: parameters and method's state that act next; `()` without overlap.
     """
 
     learner: sac.TrainState
@@ -77,17 +80,16 @@ class RunnerState(NamedTuple):
 
 
 class ChunkMetrics(NamedTuple):
-    """What happened in a chunk.
+    """Sums and counts over a chunk.
 
     Attributes:
-      episodes: `[]`, training episodes that ended.
-      returns: `[]`, the sum of their returns.
-      rewards: `[]`, the sum over steps of the mean reward of all environments.
-      updates: `[]`, steps with updates.
-      metrics: sums over these steps, of each one's last update.
-      inspected: the method's own metrics at the end.
-      successes: `rollout.Success` of `[]`, episodes among them that were solved; `()`
-        where none is known.
+      episodes: `[]`, number of training episodes that ended.
+      returns: `[]`, sum of the returns of these episodes.
+      rewards: `[]`, sum over vector steps of the mean reward over environments.
+      updates: `[]`, number of rounds of updates.
+      metrics: sums over these rounds of the metrics of each round's last update.
+      inspected: metrics of `Method.inspect` at the end of the chunk.
+      successes: `rollout.Success` of `[]`, solved episodes; `()` if not defined.
     """
 
     episodes: jax.Array
@@ -100,13 +102,13 @@ class ChunkMetrics(NamedTuple):
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
-    """`yes` where the scalar condition holds, else `no`, leaf by leaf."""
+    """Returns `yes` if the scalar condition holds, else `no`, for each leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
 def all_finite(tree: Any) -> jax.Array:
-    """`[]` bool, no leaf holds a NaN or an infinity."""
-    # A sum is not finite as soon as one term is not.
+    """Returns `[]` bool: no leaf contains NaN or infinity."""
+    # A sum is not finite if one of its terms is not.
     total = sum(jnp.sum(jnp.abs(leaf) * 1e-6) for leaf in jax.tree.leaves(tree))
     return jnp.isfinite(total)
 
@@ -121,7 +123,11 @@ def collect(
     shape: LoopConfig,
     sequence: jax.Array | None,
 ) -> tuple[CollectorState, rollout.Step]:
-    """One exploring step of all environments of a member, stored in its buffer."""
+    """Makes one exploring vector step and stores it in the member's buffer.
+
+    `key` is the step's key for collecting. `sequence` `[episode_length, envs, actions]`
+    is coloured noise, None for white. The other arguments are those of `run_chunk`.
+    """
     learner = state.learner
     buffer, episodes, extras = state.collection
     size = shape.envs, environment.action_size
@@ -135,7 +141,7 @@ def collect(
     )
     length = environment.episode_length
     if environment.varied:
-        # All episodes end together, and so are reset in a real branch.
+        # All episodes end at the same time, so `cond` computes the reset only then.
         reset_key = random_keys.named(CollectKeys, key).reset
         keys = jax.random.split(reset_key, shape.envs)
         starts = jax.lax.cond(
@@ -158,7 +164,7 @@ def store(
     step: rollout.Step,
     episode_length: int,
 ) -> replay_buffer.Replay:
-    """A member's buffer with one more step of all environments."""
+    """Adds a vector step to a member's buffer; see `replay_buffer.add`."""
     return replay_buffer.add(
         buffer,
         time,
@@ -185,21 +191,21 @@ def update_from_buffer(
     method: Method,
     settings: SacSettings,
 ) -> tuple[RunnerState, sac.Metrics]:
-    """Updates from a member's buffer, and the last one's metrics.
+    """Makes a round of updates; also returns the metrics of the last update.
 
-    All that they leave to chance is drawn before the first: many small draws would
-    take more time than one large one.
+    If a parameter becomes NaN or infinite, the round is discarded and the member
+    becomes inactive. One large random draw for all updates is faster than many small.
 
     Args:
       key: a random key.
       state: the member.
-      time: `[]` int, vector steps in the buffer.
-      first: `[]` int, updates made before; shared by all members.
-      due: `[]` bool, whether there are any; shared by all members.
-      updates: how many.
+      time: `[]` int, vector steps made so far in this task.
+      first: `[]` int, updates made before in this task; shared by all members.
+      due: `[]` bool, shared by all members; if False, nothing is done.
+      updates: number of updates in the round.
       environment: unbatched.
-      method: the method.
-      settings: SAC's.
+      method: the member's method.
+      settings: SAC's settings.
     """
     buffer, length = state.collection.buffer, environment.episode_length
     size = settings.batch_size, environment.action_size
@@ -223,7 +229,7 @@ def update_from_buffer(
 
         return sac.updates(learner, draws, batch, first, updates, method, settings)
 
-    # A loop of one turn or none, which stays one under the population.
+    # A loop with at most one iteration. All members share `due`, so vmap keeps it.
     learner, metrics = jax.lax.fori_loop(
         0,
         jnp.asarray(due, jnp.int32),
@@ -249,18 +255,17 @@ def run_chunk(
     settings: SacSettings,
     shape: LoopConfig,
 ) -> tuple[RunnerState, ChunkMetrics]:
-    """Collects and learns for some steps; one member.
+    """Collects and updates for a chunk.
 
     Args:
-      key: the task's key; a step's randomness follows from it and the time alone.
+      key: the key for this task; with a step's number it determines the step's draws.
       state: the member.
       task: the current task.
-      time: `[]` int, vector steps made before in this task. It and
-        `steps` must be shared by all members.
-      steps: `[]` int, steps to make.
+      time: `[]` int, vector steps made before in this task; shared by all members.
+      steps: `[]` int, vector steps to make; shared by all members.
       environment: unbatched.
-      method: the method.
-      settings: SAC's.
+      method: the member's method.
+      settings: SAC's settings.
       shape: static sizes.
     """
     color, length = settings.noise_color, environment.episode_length
@@ -282,7 +287,7 @@ def run_chunk(
     def step(index, carry):
         state, report, sequence = carry
         if sequence is not None:
-            # It is not part of the state: a chunk draws it anew.
+            # The noise is not part of the state, so each chunk draws it again.
             sequence = jax.lax.cond(
                 (index % length == 0) | (index == time),
                 lambda: exploration.sample_colored(key, index, size, length, settings),
@@ -338,7 +343,7 @@ def inspect(
     method: Method,
     settings: SacSettings,
 ) -> sac.Metrics:
-    """The method's own metrics after `time` steps; key and length as above."""
+    """Returns the metrics of `Method.inspect`; `length` is the episode length."""
     batch_key = random_keys.of_step(key, time).inspect
     buffer, learner = state.collection.buffer, state.learner
     batch = replay_buffer.sample(buffer, batch_key, time, settings.batch_size, length)
