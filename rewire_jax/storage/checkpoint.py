@@ -16,6 +16,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -191,8 +192,12 @@ def _write_item(folder: Path, tree: Any) -> None:
     # our devices. It stores no empty arrays and no empty trees.
     arrays = {str(i): np.asarray(x) for i, x in enumerate(leaves) if x.size}
     if arrays:
-        with _orbax() as (ocp, orbax):
-            orbax.save(folder, args=ocp.args.PyTreeSave(arrays))
+        with _orbax() as (ocp, orbax), ThreadPoolExecutor(1) as pool:
+            # An interrupt waits for a thread that has begun: what Orbax has started
+            # would go on without its folder, and log that it fails.
+            pool.submit(int).result()
+            saved = ocp.args.PyTreeSave(arrays)
+            pool.submit(orbax.save, folder, args=saved).result()
 
 
 def _read_item(folder: Path, like: Any) -> Any:

@@ -1,9 +1,12 @@
 import errno
 import logging
+import os
 import resource
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,6 +14,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 
 from rewire_jax.core.errors import UserError
@@ -290,6 +294,23 @@ def test_a_folder_that_cannot_be_made_is_a_user_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="file") as caught:
         save(tmp_path / "file" / "task-00", POLICY, {"order": 0})
     assert "\n" not in str(caught.value)
+
+
+def test_an_interrupt_waits_for_what_is_being_written(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = []
+
+    def slow(self: Any, folder: Path, args: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.2)
+        there.append(folder.parent.exists())
+
+    monkeypatch.setattr(ocp.Checkpointer, "save", slow)
+    with pytest.raises(KeyboardInterrupt):
+        save(saved.parent / "task-01", POLICY, {"order": 1})
+    assert there == [True]
+    assert [path.name for path in saved.parent.iterdir()] == [saved.name]
 
 
 def test_nothing_is_logged_and_the_level_is_given_back(
