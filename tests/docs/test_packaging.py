@@ -20,7 +20,6 @@ ROOT = Path(__file__).resolve().parents[2]
 # What takes long to import and is only needed for some of what there is to do.
 HEAVY = (
     "brax",
-    "flax",
     "gymnasium",
     "matplotlib",
     "metaworld",

@@ -20,7 +20,7 @@ TURNS = f" --tasks {TASKS} --interactions 640 --report-every 80 --checkpoint-eve
 RUN = tuple((TRAIN + TURNS).split())
 """Takes seconds. Each task has 40 steps, 8 reports and 3 checkpoints."""
 SWEEP = ("sweep", *RUN[1:], "--beta", "0.1", "10", "--members-per-batch", "2")
-TURNS = " --tasks 2 --interactions 160000 --report-every 160000 --checkpoint-every 0"
+TURNS = " --tasks 2 --interactions 80000 --report-every 80000 --checkpoint-every 0"
 LONG = tuple((TRAIN + TURNS).split())
 """Each task is one chunk, which takes seconds."""
 PATIENCE = 600.0  # seconds
