@@ -80,9 +80,7 @@ class Sweep:
             for stage in range(self.settings.tasks):
                 batches, num_slots = self.batches(stage)
                 while left := self.unfinished(stage, len(batches)):
-                    claims = [
-                        self.claim(stage, number, batches, num_slots) for number in left
-                    ]
+                    claims = [self.claim(stage, n, batches, num_slots) for n in left]
                     if not any(claims):
                         time.sleep(_POLL)
         except (Stopped, KeyboardInterrupt):
