@@ -203,7 +203,9 @@ class Render(Flags):
 
     def __call__(self) -> None:
         """Renders, then prints a summary of the episode and the files written."""
-        made = render.render(**vars(self))
+        shared = vars(Flags())
+        own = {name: x for name, x in vars(self).items() if name not in shared}
+        made = render.render(**own)
         lines = made.title, made.caption, made.page, made.gif or made.note
         print(*filter(None, lines), sep="\n")
 

@@ -1,6 +1,8 @@
 """Settings of a run: frozen dataclasses whose numbers may be traced."""
 
 import dataclasses
+import hashlib
+import json
 import math
 import numbers
 import typing
@@ -275,6 +277,26 @@ def validate(run: Settings) -> None:
 def to_json(run: Settings) -> dict[str, Any]:
     """The settings as a JSON-ready dictionary."""
     return dataclasses.asdict(run)
+
+
+def digest(*settings: Any) -> str:
+    """Identifies settings by their values; a new field with a default changes nothing.
+
+    Args:
+      settings: `Settings`, parts of them, or plain numbers.
+    """
+
+    def values(part: Any) -> Any:
+        if not dataclasses.is_dataclass(part):
+            return part
+        return {
+            field.name: values(value)
+            for field in dataclasses.fields(part)
+            if (value := getattr(part, field.name)) != field.default
+        }
+
+    text = json.dumps([values(part) for part in settings], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def from_json(data: dict[str, Any], options: type) -> Settings:

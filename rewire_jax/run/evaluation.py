@@ -113,7 +113,9 @@ def evaluate(
     plan = prepare(settings)
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = learner.params, learner.method_state
-    params, method_state = run_state.read_policies(folder, stage, like)
+    params, method_state = run_state.read_policies(
+        folder, stage, like, run_state.identity(plan.settings, plan.members)
+    )
     learner = plan.program.init(plan.stacked)._replace(
         params=params, method_state=method_state
     )

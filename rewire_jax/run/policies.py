@@ -1,7 +1,7 @@
 """Policies of a run, finished or not, as plain functions."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,10 +14,11 @@ from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Spec
 from rewire_jax.run import run_state, sweep_members
 from rewire_jax.run.run_state import saved
-from rewire_jax.run.sweep_grid import configure
+from rewire_jax.run.sweep_grid import make_members
 from rewire_jax.run.sweep_members import Found
 from rewire_jax.storage import run_folder
 from rewire_jax.training.acting import Act, Learned, act_function, mean_action
+from rewire_jax.training.population import Member, cross
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
 """`[..., observations]` -> actions `[..., actions]` in [-1, 1]."""
@@ -81,18 +82,24 @@ def load_policy(
         if not 0 <= member < len(header["members"]):
             raise UserError(f"{folder} has no member {member}: see members.csv there")
         found = sweep_members.find(folder, member, stage)
-        settings = configure(settings, header["members"][member]["values"])
+        told = header["members"][:: settings.seeds]
+        _, members = make_members(settings, [each["values"] for each in told])
+        owner = run_state.identity(settings, [members[n] for n in found.members])
+        options = members[member].options
     else:
         if member is not None:
             raise UserError(f"{folder} holds a run: give seed, not member")
         seed = settings.seed if seed is None else seed
-        found = Found(folder, stage, seed - settings.seed, settings.seeds)
+        owner = run_state.identity(settings, _members(settings))
+        options = settings.options
+        place = seed - settings.seed
+        found = Found(folder, stage, place, settings.seeds, ())
         if not 0 <= found.place < found.num_slots:
             raise UserError(
                 f"{folder} has no seed {seed}: see {run_folder.HEADER} there"
             )
-    method = find_method(settings.method).make(spec, settings.options)
-    learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method))
+    method = find_method(settings.method).make(spec, options)
+    learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method, owner))
     policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
     return functools.partial(mean_action, method, spec, policy)
 
@@ -116,10 +123,12 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
     header, settings, spec = _read(folder, "run")
     method = find_method(settings.method).make(spec, settings.options)
 
-    seeds = range(settings.seed, settings.seed + settings.seeds)
-    members = _load(Found(folder, stage, 0, settings.seeds), method)
+    members = _members(settings)
+    owner = run_state.identity(settings, members)
+    learned = _load(Found(folder, stage, 0, settings.seeds, ()), method, owner)
+    seeds = tuple(member.seed for member in members)
     act = act_function(method, spec)
-    return Policies(act, members, tuple(seeds), tuple(header["tasks"]))
+    return Policies(act, learned, seeds, tuple(header["tasks"]))
 
 
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
@@ -128,9 +137,15 @@ def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
     return header, settings, Spec(**header["spec"])
 
 
-def _load(found: Found, method: Method) -> Learned:
+def _members(settings: Settings) -> tuple[Member, ...]:
+    """The members of a run, one for each seed."""
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    return cross([(settings.sac, settings.options)], seeds)
+
+
+def _load(found: Found, method: Method, owner: Mapping[str, Any]) -> Learned:
     """What the members that trained together have learned, `[num_slots]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.num_slots))
     like = jax.eval_shape(jax.vmap(method.init), keys)
-    learned = run_state.read_policies(found.folder, found.stage, like)
+    learned = run_state.read_policies(found.folder, found.stage, like, owner)
     return Learned(*jax.tree.map(jnp.asarray, learned))

@@ -6,7 +6,7 @@ finished tasks; everything else is reset at the start of a task.
 only the newest of these is kept.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings, from_json
+from rewire_jax.core.settings import Settings, digest, from_json
 from rewire_jax.methods import find_method
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.json_lines import reading
 from rewire_jax.training import population
+from rewire_jax.training.population import Member
 from rewire_jax.training.run_setup import Plan
 from rewire_jax.training.sac import TrainState
 from rewire_jax.training.train_loop import RunnerState
@@ -68,7 +69,13 @@ def interactions(standing: RunState, plan: Plan) -> int:
     return standing.stage * plan.interactions + steps * plan.settings.envs
 
 
-def save(folder: Path, standing: RunState) -> None:
+def identity(settings: Settings, members: Sequence[Member]) -> dict[str, Any]:
+    """Identifies what a checkpoint belongs to: the settings and each member's own."""
+    own = [[m.number, digest(m.seed, m.sac, m.options)] for m in members]
+    return {"settings": digest(settings), "members": own}
+
+
+def save(folder: Path, standing: RunState, plan: Plan) -> None:
     """Writes a checkpoint, and deletes older ones from the middle of a task."""
     items: dict[str, Any] = {
         "counts": {"active": standing.active, "selection": standing.selection}
@@ -85,6 +92,7 @@ def save(folder: Path, standing: RunState) -> None:
         "steps": standing.steps,
         "items": sorted(items),
         "tables": run_folder.marks(folder),
+        "identity": identity(plan.settings, plan.members),
     }
     checkpoint.save(folder / _FOLDER / name, items, metadata)
     checkpoints = checkpoint.available(folder / _FOLDER)
@@ -94,11 +102,12 @@ def save(folder: Path, standing: RunState) -> None:
 def kept(folder: Path, stage: int | None) -> Path:
     """Returns the checkpoint after a stage, by default the latest stage.
 
+    It may be damaged: an older one does not take its place.
+
     Raises:
       UserError: there is none.
     """
-    checkpoints = checkpoint.available(folder / _FOLDER)
-    between = [path for path in checkpoints if "-step-" not in path.name]
+    between = sorted((folder / _FOLDER).glob("task-[0-9][0-9][0-9]"), reverse=True)
     if stage is not None:
         between = [path for path in between if path.name == _name(stage + 1)]
     if not between:
@@ -117,14 +126,21 @@ def finished(folder: Path, stage: int) -> bool:
 def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | None:
     """Returns the newest state whose checkpoint and rows are complete, or None.
 
-    Removes rows of the tables that were written after this checkpoint.
+    Removes rows of the tables that were written after this checkpoint. If it is not the
+    newest one, or there is none, copies of the tables are kept: their rows may not be
+    computed again as they were.
 
     Args:
       folder: folder of the run.
       plan: plan of the run.
-      say: is told about every checkpoint that cannot be used.
+      say: is told about every checkpoint that cannot be used, and about copies.
+
+    Raises:
+      UserError: `checkpoints` is a link or no folder.
     """
-    for path in checkpoint.available(folder / _FOLDER):
+    run_folder.check_own(folder / _FOLDER)
+    found = sorted((folder / _FOLDER).glob("task-*"), reverse=True)
+    for path in found:
         try:
             standing, marks = _load(path, plan)
         except checkpoint.CheckpointError as error:
@@ -132,21 +148,33 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
             continue
         changed = run_folder.changed(folder, marks)
         if not changed:
+            if path != found[0]:
+                _keep_copies(folder, marks, say)
             run_folder.cut(folder, marks)
             return standing
         say(
             f"{changed} has lost or foreign rows; falling back to the checkpoint "
             f"before {path.name}"
         )
+    _keep_copies(folder, {}, say)
     run_folder.cut(folder, {})
     return None
+
+
+def _keep_copies(
+    folder: Path, marks: Mapping[str, run_folder.Mark], say: Callable[[str], None]
+) -> None:
+    copies = run_folder.copies(folder, marks)
+    if copies:
+        names = ", ".join(copy.name for copy in copies)
+        say(f"rows that are removed from the tables are kept in {names}")
 
 
 def _load(path: Path, plan: Plan) -> tuple[RunState, dict[str, run_folder.Mark]]:
     program, members = plan.program, plan.stacked
     learner = jax.eval_shape(program.init, members)
     like: dict[str, Any] = {"counts": _counts(plan)}
-    metadata = _facts(path)
+    metadata = _facts(path, identity(plan.settings, plan.members))
     saved = metadata["items"]
     if "state" in saved:
         task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
@@ -182,17 +210,20 @@ def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = {"counts": _counts(plan)} | _kept(learner)
     path = folder / _FOLDER / _name(stage + 1)
-    _facts(path)
+    _facts(path, identity(plan.settings, plan.members))
     return checkpoint.load(path, like)[0]
 
 
-def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
+def read_policies(
+    folder: Path, stage: int | None, like: Any, owner: Mapping[str, Any]
+) -> Any:
     """The policies kept after a stage, or after the latest one.
 
     Args:
       folder: folder of the run.
       stage: of its sequence, or None.
       like: params and method_state, `[members]`, as shapes.
+      owner: `identity` of the run.
 
     Returns:
       The same, on the host.
@@ -202,7 +233,7 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
     """
     path = kept(folder, stage)
     try:
-        _facts(path)
+        _facts(path, owner)
         return checkpoint.load(path, {"policy": like})[0]["policy"]
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(
@@ -210,11 +241,12 @@ def read_policies(folder: Path, stage: int | None, like: Any) -> Any:
         ) from error
 
 
-def _facts(path: Path) -> dict[str, Any]:
+def _facts(path: Path, owner: Mapping[str, Any]) -> dict[str, Any]:
     """What a checkpoint says of itself.
 
     Raises:
-      CheckpointError: it is not that of a run, or it is another than its name says.
+      CheckpointError: it is not that of a run, or of another run than the owner, or it
+        is another than its name says.
     """
     facts = checkpoint.read_metadata(path)
     try:
@@ -225,6 +257,11 @@ def _facts(path: Path) -> dict[str, Any]:
         raise checkpoint.CheckpointError(str(error)) from error
     if path.name != name:
         raise checkpoint.CheckpointError(f"checkpoint {path} was written as {name}")
+    for part, own in owner.items():
+        if facts.get("identity", {}).get(part) != own:
+            raise checkpoint.CheckpointError(
+                f"checkpoint {path} belongs to another run: it has other {part}"
+            )
     return facts
 
 

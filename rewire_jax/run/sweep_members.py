@@ -9,12 +9,21 @@ from rewire_jax.storage.sweep_results import batch, batches_of, read_batches
 
 
 class Found(NamedTuple):
-    """Where a member's policies are: folder, stage, and its place among so many."""
+    """Where a member's policies are.
+
+    Attributes:
+      folder: of the checkpoints.
+      stage: the task after which; None for the latest.
+      place: of the member among those that were trained together.
+      num_slots: of these.
+      members: numbers of those in a batch of a sweep.
+    """
 
     folder: Path
     stage: int | None
     place: int
     num_slots: int
+    members: tuple[int, ...]
 
 
 def find(folder: Path, member: int, stage: int | None) -> Found:
@@ -30,6 +39,7 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
         for number, members in enumerate(batches):
             inside = batch(folder, each, number)
             if member in members and run_state.finished(inside, each):
-                return Found(inside, each, members.index(member), num_slots)
+                place = members.index(member)
+                return Found(inside, each, place, num_slots, tuple(members))
     when = "any task" if stage is None else f"task {stage}"
     raise UserError(f"{folder}: member {member} has not been trained on {when} yet")

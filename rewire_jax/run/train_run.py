@@ -98,7 +98,7 @@ class Run:
             offline = now.steps >= budget.steps
             now = self.offline_update(now) if offline else self.chunk(now, task)
             if self.interrupt.stopping:
-                run_state.save(self.folder, now)
+                run_state.save(self.folder, now, self.plan)
                 raise Stopped(
                     f"stopped and saved: continue with --resume --out {self.folder}"
                 )
@@ -107,7 +107,7 @@ class Run:
         now = now._replace(learner=now.state.learner, state=None)
         now = self.conclude(now, task)
         returns = self.evaluate(now, stage)[:, stage]
-        run_state.save(self.folder, now)
+        run_state.save(self.folder, now, self.plan)
         self.recorder.finished(stage, returns, clock.perf_counter() - began)
         return now
 
@@ -218,7 +218,7 @@ class Run:
         due = settings.checkpoint_every and now.steps // interval > before // interval
         budget = self.plan.budget
         if due and now.steps < budget.steps + budget.offline_steps:
-            run_state.save(self.folder, now)
+            run_state.save(self.folder, now, self.plan)
 
     def conclude(self, now: RunState, task: Task) -> RunState:
         """Evaluates the candidates, then lets the method end the task."""

@@ -28,7 +28,7 @@ import numpy as np
 from rewire_jax.core.errors import REMEDY, UserError
 from rewire_jax.version import __version__
 
-_FORMAT = 2
+_FORMAT = 3
 _MANIFEST = "manifest.json"
 _TEMPORARY = ".tmp-"
 _KINDS = (np.bool_, np.number, jax.dtypes.prng_key)

@@ -250,7 +250,9 @@ def compare(folder: Path, settings: Settings, kind: str = "run") -> None:
 
 
 def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Adds rows to a table; `UserError` if they cannot be written."""
+    """Adds rows to a table; `UserError` if it is a link or cannot be written."""
+    if (folder / table).is_symlink():
+        raise UserError(f"{folder / table} is a link: replace it by what it names")
     text = "".join(json.dumps(row) + "\n" for row in rows)
     with writing(folder / table), (folder / table).open("a") as file:
         file.write(text)
@@ -275,6 +277,30 @@ def changed(folder: Path, marks: Mapping[str, Mark]) -> Path | None:
     return None
 
 
+def copies(folder: Path, marks: Mapping[str, Mark]) -> list[Path]:
+    """Copies each table that `cut` would shorten, under a name with the time.
+
+    Raises:
+      UserError: a copy cannot be written.
+    """
+    made = []
+    now = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+    for table in TABLES:
+        held = _bytes(folder / table)
+        if len(held) > _parts(marks.get(table, 0))[0]:
+            copy = folder / f"{table}.{now}"
+            with writing(copy):
+                copy.write_bytes(held)
+            made.append(copy)
+    return made
+
+
+def check_own(path: Path) -> None:
+    """Raises `UserError` if a folder that is to be written in is a link or a file."""
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        raise UserError(f"{path} is not a folder of this run: move it away")
+
+
 def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
     """Forgets what was written after `marks` were taken; of other tables everything.
 
@@ -285,6 +311,8 @@ def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
         path = folder / table
         length, _ = _parts(marks.get(table, 0))
         with writing(path):
+            if path.is_symlink():
+                raise UserError(f"{path} is a link: replace it by what it names")
             if path.exists() and path.stat().st_size > length:
                 os.truncate(path, length)
 

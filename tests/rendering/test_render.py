@@ -50,7 +50,7 @@ def untrained(folder: Path, scenario: str, *, stage: int = 2, **more) -> Path:
     }
     with run_folder.held(folder, header):
         at = batch(folder, stage - 1, 0) if "members" in more else folder
-        run_state.save(at, run_state.start(plan)._replace(stage=stage))
+        run_state.save(at, run_state.start(plan)._replace(stage=stage), plan)
     return folder
 
 

@@ -1,0 +1,126 @@
+"""Checkpoints and tables that are not those of the run in whose folder they are."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import pytest
+
+import rewire_jax
+from rewire_jax import UserError
+from rewire_jax.core.settings import Settings, digest
+from rewire_jax.run import run_state
+from rewire_jax.storage.run_folder import TABLES
+from rewire_jax.training.run_setup import prepare
+from tests.tiny import tiny
+
+
+def small(**changes) -> Settings:
+    return dataclasses.replace(tiny(method="ft1"), tasks=2, **changes)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rewire_jax.train(small(), tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(trained, tmp_path / "run")
+
+
+def rows(folder: Path, name: str = "results.jsonl") -> bytes:
+    return (folder / name).read_bytes()
+
+
+def copies(folder: Path, table: str) -> list[bytes]:
+    return [path.read_bytes() for path in folder.glob(f"{table}.*")]
+
+
+def test_what_no_checkpoint_belongs_to_is_kept_as_a_copy(
+    run: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(run / "checkpoints")
+    (run / "results.jsonl").write_bytes(rows(trained).replace(b"\n", b"\r\n"))
+    held = {table: rows(run, table) for table in TABLES}
+    rewire_jax.train(small(), run, resume=True)
+    assert "results.jsonl" in capsys.readouterr().err
+    for table in TABLES:
+        assert copies(run, table) == [held[table]]
+    assert rows(run) == rows(trained)
+
+
+def test_a_fallback_keeps_a_copy_and_a_plain_resume_none(
+    run: Path, trained: Path
+) -> None:
+    table = run / "training.jsonl"
+    table.write_bytes(rows(run, "training.jsonl") + b'{"half a row')
+    rewire_jax.train(small(), run, resume=True)
+    assert not copies(run, "training.jsonl")
+    assert rows(run, "training.jsonl") == rows(trained, "training.jsonl")
+    (run / "checkpoints/task-002/manifest.json").unlink()
+    rewire_jax.train(small(), run, resume=True)
+    assert copies(run, "results.jsonl") == [rows(trained)]
+    assert rows(run) == rows(trained)
+
+
+@pytest.mark.parametrize("change", [{"seed": 5}, {"warmup": 320}])
+def test_another_runs_checkpoint_is_never_used(
+    change: dict, run: Path, trained: Path
+) -> None:
+    plan = prepare(small(**change))
+    state = run_state.start(plan)._replace(stage=2)
+    run_state.save(run.parent / "other", state, plan)
+    shutil.rmtree(run / "checkpoints/task-002")
+    shutil.move(run.parent / "other/checkpoints/task-002", run / "checkpoints")
+    for use in (
+        lambda: rewire_jax.evaluate(run, episodes=1),
+        lambda: rewire_jax.load_policy(run, task=0),
+        lambda: rewire_jax.load_policies(run),
+    ):
+        with pytest.raises(UserError, match="task-002"):
+            use()
+    rewire_jax.load_policies(run, stage=0)
+    rewire_jax.train(small(), run, resume=True)
+    assert rows(run) == rows(trained)
+    rewire_jax.load_policies(run)
+
+
+def test_an_older_checkpoint_does_not_take_the_latests_place(run: Path) -> None:
+    (run / "checkpoints/task-002/manifest.json").unlink()
+    with pytest.raises(UserError, match="task-002"):
+        rewire_jax.load_policies(run)
+
+
+def test_nothing_is_written_through_a_link(run: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    shutil.move(run / "results.jsonl", outside)
+    (run / "results.jsonl").symlink_to(outside)
+    shutil.rmtree(run / "checkpoints/task-002")
+    held = outside.read_bytes()
+    with pytest.raises(UserError, match=r"results\.jsonl"):
+        rewire_jax.train(small(), run, resume=True)
+    assert outside.read_bytes() == held
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_a_folder_of_checkpoints_that_is_none(kind: str, run: Path) -> None:
+    shutil.move(run / "checkpoints", run.parent / "elsewhere")
+    if kind == "file":
+        (run / "checkpoints").touch()
+    else:
+        (run / "checkpoints").symlink_to(run.parent / "elsewhere")
+    held = rows(run)
+    with pytest.raises(UserError, match="checkpoints"):
+        rewire_jax.train(small(), run, resume=True)
+    assert rows(run) == held
+
+
+def test_a_digest_tells_values_apart_and_ignores_defaults() -> None:
+    settings = small()
+    other = dataclasses.replace(
+        settings, sac=dataclasses.replace(settings.sac, discount=0.5)
+    )
+    assert digest(settings) == digest(dataclasses.replace(settings))
+    assert digest(settings) != digest(other)
+    assert digest(1, settings.sac) != digest(2, settings.sac)
