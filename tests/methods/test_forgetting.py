@@ -84,7 +84,7 @@ def num_plays(method: str) -> int:
     prepared = run_setup.prepare(settings(method), SCENARIO)
     options = prepared.settings
     sizes = {(len(GOALS), options.eval_episodes)}
-    return len(sizes | {(prepared.rows, options.selection_episodes)})
+    return len(sizes | {(prepared.budget.rows, options.selection_episodes)})
 
 
 @pytest.fixture(scope="module")
