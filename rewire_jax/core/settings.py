@@ -193,7 +193,7 @@ _AT_LEAST: dict[str, float] = {
 }
 # Counters and floats have 32 bits. The other limits only prevent endless loops.
 _LARGEST = 2**31
-_LARGEST_FLOAT = 3.4e38
+_LARGEST_FLOAT, _SMALLEST_FLOAT = 3.4e38, 1.2e-38
 _AT_MOST = {"seeds": 4_096, "depth": 1_000}
 _POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
 _SHARE = ("discount", "target_rate")
@@ -234,9 +234,16 @@ def check_kinds(group: Any) -> None:
                 most = _AT_MOST.get(name, _LARGEST - 1)
                 require(value <= most, f"{flag(name)} must be at most {most}, {told}")
             if kind is float:
-                # `validate` reports NaN and infinity. Large ints are no floats.
-                small = not _LARGEST_FLOAT <= abs(value) < math.inf
-                require(small, f"{flag(name)} is too large for a 32-bit float: {value}")
+                _check_float(flag(name), value)
+
+
+def _check_float(name: str, value: float) -> None:
+    # Comparing first: a large int is no float.
+    large = abs(value) >= _LARGEST_FLOAT
+    require(value == value and abs(value) != math.inf, f"{name} must be finite")
+    require(not large, f"{name} is too large for a 32-bit float: {value}")
+    lost = value != 0 and abs(value) < _SMALLEST_FLOAT
+    require(not lost, f"{name} is too small for a 32-bit float: {value}")
 
 
 def validate(run: Settings) -> None:
@@ -247,9 +254,6 @@ def validate(run: Settings) -> None:
     for group in (run, run.sac, run.options):
         check_kinds(group)
     values = vars(run) | vars(run.sac)
-    for name, value in values.items():
-        if isinstance(value, float):
-            require(value - value == 0, f"{flag(name)} must be finite, not {value}")
     for name, least in _AT_LEAST.items():
         require(
             values[name] >= least,

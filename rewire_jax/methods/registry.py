@@ -65,7 +65,13 @@ METHODS: dict[str, Entry] = {
 
 
 def register_method(name: str, entry: Entry) -> None:
-    """Adds a method of one's own, usable by name wherever the others are."""
+    """Adds your own method; use it by its name, like the others.
+
+    Raises:
+      UserError: another method has that name.
+    """
+    if METHODS.get(name, entry) != entry:
+        raise UserError(f"there is another method named {name!r}: choose another name")
     METHODS[name] = entry
 
 

@@ -37,8 +37,12 @@ def permute(x: jax.Array, scores: jax.Array, tau: jax.typing.ArrayLike) -> jax.A
 
     Raises:
       AssertionError: the shapes do not fit, or an array is not of floats.
+      ValueError: tau is known and not a positive, finite 32-bit float.
     """
     chex.assert_rank([scores, tau], [1, 0])
+    known = not isinstance(tau, jax.core.Tracer)
+    if known and not 0 < np.asarray(tau, np.float32) < np.inf:
+        raise ValueError(f"tau must be positive and finite in 32 bits, not {tau}")
     chex.assert_axis_dimension(x, -1, scores.shape[0])
     chex.assert_type([x, scores], float)
     return _permute(x, scores, tau)
@@ -114,6 +118,7 @@ def _order(scores):
     bits = jax.lax.bitcast_convert_type(scores + 0.0, jnp.uint32)  # no negative zeros
     # Words in the order of the numbers.
     bits = jnp.where(bits >= sign, ~bits, bits | sign)
+    bits = jnp.where(jnp.isnan(scores), ~np.uint32(0), bits)  # last, in their order
     place = jnp.arange(n, dtype=jnp.uint32)
     first = jnp.sort((bits << 16) | place) & half
     second = jnp.sort((_take(bits, first) & ~half) | place) & half

@@ -47,6 +47,8 @@ def act_function(method: Method, spec: Spec) -> Act:
     def act(
         learned: Learned, task: jax.Array | int, observation: jax.Array
     ) -> jax.Array:
+        if isinstance(task, int) and not 0 <= task < spec.tasks:
+            raise ValueError(f"task must be 0 to {spec.tasks - 1}, not {task}")
         policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
         return mean_action(method, spec, policy, observation)
 

@@ -1,6 +1,7 @@
 """Values of settings that come from elsewhere than the command line."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,9 @@ def changed(name: str, value: Any) -> Settings:
         ("modes", 2**31, "--modes must be at most 2147483647"),
         ("depth", 10**400, r"--depth must be at most 1000, not 10{79}$"),
         ("beta", 1e39, "--beta is too large for a 32-bit float"),
+        ("beta", math.inf, "--beta must be finite"),
+        ("discount", math.nan, "--discount must be finite"),
+        ("tau", 1e-50, "--tau is too small for a 32-bit float"),
     ],
 )
 def test_a_value_of_another_kind_is_named(name: str, value: Any, says: str) -> None:

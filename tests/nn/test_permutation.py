@@ -1,4 +1,5 @@
 import functools
+import math
 
 import chex
 import jax
@@ -137,6 +138,26 @@ def test_what_does_not_fit_is_refused(x, scores, tau):
         permute(x, scores, tau)
     with pytest.raises(AssertionError):
         jax.eval_shape(permute, x, scores, tau)  # known without computing
+
+
+@pytest.mark.parametrize("tau", [0.0, -1.0, math.nan, math.inf, 1e-50, np.zeros(())])
+def test_a_temperature_that_is_none_is_refused(tau):
+    with pytest.raises(ValueError, match="tau"):
+        permute(jnp.ones(3), jnp.arange(3.0), tau)
+
+
+@pytest.mark.parametrize(
+    "scores",
+    [
+        [math.nan, -math.nan, 1.0, -1.0],
+        [1.0, math.nan, 0.0, -math.inf, math.inf, math.nan, -0.0, 0.0],
+        [-math.nan] * 3,
+    ],
+)
+def test_scores_that_are_no_numbers_come_last(scores):
+    scores = jnp.asarray(scores)
+    x = jnp.arange(len(scores)) + 0.5
+    np.testing.assert_array_equal(permute(x, scores, 1.0), x[jnp.argsort(scores)])
 
 
 def test_ties_keep_their_place():

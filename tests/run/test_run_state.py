@@ -4,6 +4,8 @@ import dataclasses
 import shutil
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import rewire_jax
@@ -84,6 +86,15 @@ def test_another_runs_checkpoint_is_never_used(
     rewire_jax.train(small(), run, resume=True)
     assert rows(run) == rows(trained)
     rewire_jax.load_policies(run)
+
+
+@pytest.mark.parametrize("task", [-1, 2])
+def test_a_task_that_is_not_there(task: int, trained: Path) -> None:
+    policies = rewire_jax.load_policies(trained)
+    learned = jax.tree.map(lambda leaf: leaf[0], policies.members)
+    with pytest.raises(ValueError, match="task"):
+        policies.act(learned, task, jnp.zeros(2))
+    assert policies.act(learned, 1, jnp.zeros(2)).shape == (2,)
 
 
 def test_an_older_checkpoint_does_not_take_the_latests_place(run: Path) -> None:
