@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.storage import run_folder
+from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.json_lines import index, number, reading, table
 from rewire_jax.storage.scores import SUCCESS
 
@@ -92,6 +92,22 @@ def read_header(folder: Path, kind: str) -> Results:
     if lacks or not results.tasks:
         raise UserError(f"{path} lacks {', '.join(lacks) or 'tasks'}")
     return results
+
+
+def check_tables(folder: Path) -> None:
+    """Raises `UserError` if rows have changed since a run's newest checkpoint."""
+    for path in checkpoint.available(folder / "checkpoints"):
+        try:
+            marks = checkpoint.read_metadata(path).get("tables", {})
+        except UserError:  # damaged, or just replaced by a run that goes on
+            continue
+        changed = run_folder.changed(folder, marks)
+        if changed:
+            raise UserError(
+                f"{changed} has lost or changed rows since it was written: restore it, "
+                "or run the command again with --resume"
+            )
+        return
 
 
 def read_evaluations(

@@ -13,6 +13,7 @@ from rewire_jax.storage.result_files import (
     Array,
     Flags,
     Results,
+    check_tables,
     read_evaluations,
     read_header,
     read_timing,
@@ -92,6 +93,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     """
     head = read_header(Path(folder), "run")
     folder, tasks = head.folder, len(head.tasks)
+    check_tables(folder)
     path = folder / "results.jsonl"
     rows = read_evaluations(path, tasks, lambda row: int(row["seed"]))
     if not rows:

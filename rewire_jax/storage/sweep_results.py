@@ -15,6 +15,7 @@ from rewire_jax.storage.result_files import (
     Flags,
     Results,
     Rows,
+    check_tables,
     read_evaluations,
     read_header,
     read_timing,
@@ -112,6 +113,7 @@ def read_sweep(folder: str | Path) -> SweepData:
 
     for now, place, members in _batches(head.folder, count, tasks):
         trained[members, now] = True
+        check_tables(place)
         hours += read_timing(place / "timing.jsonl", tasks, len(members), False).hours
         rows |= read_evaluations(
             place / "results.jsonl", tasks, member, also=("choice",), needed=False

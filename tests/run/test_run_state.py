@@ -103,6 +103,26 @@ def test_an_older_checkpoint_does_not_take_the_latests_place(run: Path) -> None:
         rewire_jax.load_policies(run)
 
 
+def test_a_report_refuses_rows_that_the_run_did_not_write(
+    run: Path, trained: Path, tmp_path: Path
+) -> None:
+    rewire_jax.write_report([run], tmp_path / "report")
+    held = rows(run)
+    digit = next(
+        i for i in reversed(range(len(held))) if held[i : i + 1] in b"12345678"
+    )
+    other = bytes([held[digit] + 1])
+    (run / "results.jsonl").write_bytes(held[:digit] + other + held[digit + 1 :])
+    with pytest.raises(UserError, match=r"results\.jsonl"):
+        rewire_jax.write_report([run], tmp_path / "report")
+    rewire_jax.train(small(), run, resume=True)
+    rewire_jax.write_report([run], tmp_path / "report")
+    # Rows that came after the checkpoint are those of a run that goes on.
+    with (run / "results.jsonl").open("ab") as table:
+        table.write(rows(trained).splitlines(keepends=True)[-1])
+    rewire_jax.write_report([run], tmp_path / "report")
+
+
 def test_nothing_is_written_through_a_link(run: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     shutil.move(run / "results.jsonl", outside)
