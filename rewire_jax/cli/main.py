@@ -1,6 +1,8 @@
 """The `rewire-jax` command."""
 
 import contextlib
+import errno
+import io
 import os
 import signal
 import sys
@@ -17,6 +19,7 @@ from rewire_jax.run import interrupts
 from rewire_jax.version import __version__
 
 _INTERRUPTED = 130
+_PIPE_CLOSED = 141
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -28,9 +31,17 @@ def main(words: Sequence[str] | None = None) -> None:
     debug = "--debug" in words
     if not debug:
         sys.unraisablehook = _unraisable
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # where a terminal knows ASCII only
     try:
         with _stoppable():
             _run(words)
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Who read the output has closed it, as `head` does.
+        _discard_output()
+        sys.exit(_PIPE_CLOSED)
     except (Exception, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
@@ -46,6 +57,11 @@ def _run(words: Sequence[str]) -> None:
         return
     keep_compiled(known.cache)
     arguments.command(words, known)()
+
+
+def _discard_output() -> None:
+    """Keeps Python from trying again when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
@@ -88,6 +104,10 @@ def _ending(error: BaseException) -> tuple[str, int]:
     """The line in which a command ends, and its exit status."""
     if isinstance(error, UserError):
         return f"error: {error}", 2
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        # Files are written by those who make a `UserError` of it.
+        _discard_output()
+        return f"error: cannot write to the standard output: {error.strerror}", 2
     if isinstance(error, interrupts.Stopped):
         return str(error), _INTERRUPTED
     if isinstance(error, KeyboardInterrupt):

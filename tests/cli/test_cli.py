@@ -1,5 +1,7 @@
 import json
+import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -287,3 +289,37 @@ def test_nothing_is_imported_upward() -> None:
     assert "rewire_jax.cli.main" in sys.modules
     assert sorted(rewire_jax.__all__) == rewire_jax.__all__
     assert all(hasattr(rewire_jax, name) for name in rewire_jax.__all__)
+
+
+LIST = [sys.executable, "-m", "rewire_jax.cli.main", "list"]
+
+
+def test_a_reader_that_has_gone_is_no_error() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(LIST, stdout=writing, stderr=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert done.returncode == 141
+    assert not done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_output_that_nothing_takes_is_told_in_a_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(LIST, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert done.returncode == 2
+    assert done.stderr.count(b"\n") == 1
+    assert b"standard output" in done.stderr
+
+
+def test_a_terminal_may_know_ascii_only() -> None:
+    for words in ([*LIST[:-1], "--help"], [*LIST, "--unknown"]):
+        done = subprocess.run(
+            words,
+            env=os.environ | {"PYTHONIOENCODING": "ascii"},
+            capture_output=True,
+            check=False,
+        )
+        assert done.returncode == (0 if "--help" in words else 2)
+        assert b"unexpected" not in done.stderr
+        assert b"Traceback" not in done.stderr
