@@ -88,7 +88,7 @@ def test_folder_that_cannot_be_written_stops_nothing(tmp_path):
     _, hits, misses, error = finish(start(tmp_path / "file"))
     assert (hits, misses) == (0, 0)
     assert error.count("\n") == 1
-    assert "not kept" in error
+    assert str(tmp_path / "file") in error
 
 
 def test_other_folder_or_none(tmp_path):
@@ -116,7 +116,7 @@ def test_command_reads_its_flag(monkeypatch, capsys):
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main.main(["list", "--cache"])
-    assert capsys.readouterr().err == "error: --cache needs a folder, or off\n"
+    assert "--cache" in capsys.readouterr().err
 
 
 def test_import_touches_no_device_and_sets_nothing():

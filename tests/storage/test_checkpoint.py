@@ -224,9 +224,9 @@ def test_what_may_be_whole_is_not_called_damaged(
 
 
 def test_another_format_names_the_version(saved: Path) -> None:
-    change_manifest(saved, '"format": 2', '"format": 9')
+    change_manifest(saved, '"format": 3', '"format": 9')
     change_manifest(saved, f'"version": "{__version__}"', '"version": "9.8"')
-    with pytest.raises(ForeignError, match=r"format 9, not 2; .* rewire_jax 9\.8"):
+    with pytest.raises(ForeignError, match=r"format 9, not 3; .* rewire_jax 9\.8"):
         load(saved, POLICY)
 
 
