@@ -52,7 +52,9 @@ def _fields(app: Any, what: str, name: str, each: Any, *rest: Any) -> Any:
 def _prepare(app: Any) -> None:
     """Makes the drawings, and copies the notebooks to where Sphinx looks for pages."""
     drawings.write(ROOT / "docs/drawings")
-    (ROOT / "docs/notebooks").mkdir(exist_ok=True)
+    # Anew: pages of an earlier version would stand beside the copies.
+    shutil.rmtree(ROOT / "docs/notebooks", ignore_errors=True)
+    (ROOT / "docs/notebooks").mkdir()
     for path in (ROOT / "notebooks").glob("*.ipynb"):
         shutil.copy(path, ROOT / "docs/notebooks")
 

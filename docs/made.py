@@ -23,6 +23,7 @@ from rewire_jax.cli import main
 from rewire_jax.cli.commands import COMMANDS, Flags
 from rewire_jax.core.settings import SacSettings, Settings, flag, traced_fields
 from rewire_jax.methods import METHODS
+from rewire_jax.reports.table import to_markdown
 
 ROOT = Path(__file__).resolve().parent.parent
 _EXAMPLE = "halfcheetah/forgetting"
@@ -38,8 +39,7 @@ def fill(app: Any, page: str, source: list[str]) -> None:
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(to_markdown(heads, rows)).strip()
 
 
 class Item(typing.NamedTuple):

@@ -203,9 +203,16 @@ class Render(Flags):
 
     def __call__(self) -> None:
         """Renders, then prints a summary of the episode and the files written."""
-        shared = vars(Flags())
-        own = {name: x for name, x in vars(self).items() if name not in shared}
-        made = render.render(**own)
+        made = render.render(
+            self.run,
+            task=self.task,
+            seed=self.seed,
+            stage=self.stage,
+            member=self.member,
+            episode=self.episode,
+            out=self.out,
+            seconds=self.seconds,
+        )
         lines = made.title, made.caption, made.page, made.gif or made.note
         print(*filter(None, lines), sep="\n")
 

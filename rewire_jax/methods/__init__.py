@@ -1,18 +1,8 @@
 """The methods, and what one of your own is made of."""
 
+from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import flag, require, settings, static, traced
-from rewire_jax.methods.base import (
-    Candidates,
-    Method,
-    Selection,
-    Shared,
-    Spec,
-    Tools,
-    at,
-    count,
-    put,
-    tile,
-)
+from rewire_jax.methods.base import Candidates, Method, Selection, Shared, Spec, Tools
 from rewire_jax.methods.finetune import FinetuneSettings, ft1, ft_n, sac_n
 from rewire_jax.methods.registry import METHODS, Entry, find_method, register_method
 from rewire_jax.nn import networks

@@ -106,6 +106,11 @@ class Selection(NamedTuple):
     before: jax.Array | None
     after: jax.Array
 
+    @property
+    def ranked(self) -> jax.Array:
+        """`after` with -inf for NaN, which argmax would choose."""
+        return jnp.where(jnp.isnan(self.after), -jnp.inf, self.after)
+
 
 class Init(Protocol):
     """Returns parameters and state; called once, before the first task."""
@@ -326,23 +331,3 @@ class Method(NamedTuple):
     in_budget: bool = False
     candidate_score: CandidateScore = "episode"
     end_task: EndTask = lambda params, state, task, selection: (params, state)
-
-
-def count(tree: Any) -> int:
-    """Returns how many numbers a pytree of arrays holds."""
-    return sum(leaf.size for leaf in jax.tree.leaves(tree))
-
-
-def tile(tree: Any, copies: int) -> Any:
-    """Returns copies of a pytree's arrays, stacked on a new leading axis."""
-    return jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * x.ndim)), tree)
-
-
-def at(tree: Any, index: jax.Array) -> Any:
-    """Returns the entries of a stacked pytree at an index."""
-    return jax.tree.map(lambda x: x[index], tree)
-
-
-def put(tree: Any, index: jax.Array, value: Any) -> Any:
-    """Returns a stacked pytree with the entries at an index replaced."""
-    return jax.tree.map(lambda x, v: x.at[index].set(v), tree, value)

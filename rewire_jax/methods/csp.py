@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.pytrees import count, put, tile
 from rewire_jax.methods.base import (
     Candidates,
     Method,
@@ -18,9 +19,6 @@ from rewire_jax.methods.base import (
     Selection,
     Spec,
     Tools,
-    count,
-    put,
-    tile,
 )
 from rewire_jax.methods.csp_settings import CspSettings
 from rewire_jax.nn import networks
@@ -230,9 +228,7 @@ def end_task(
     kept = jnp.asarray(True)
     if selection is not None:
         half = design.options.rollouts // 2
-        # NaN must not win, as it would in argmax.
-        failed = jnp.isnan(selection.after)
-        returns = jnp.where(failed, -jnp.inf, selection.after).reshape(2, half)
+        returns = selection.ranked.reshape(2, half)
         new, former = jnp.max(returns, axis=1)
         better = new > (1 + design.options.improvement) * former
         first = state.frozen == 0

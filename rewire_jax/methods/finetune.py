@@ -5,8 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import settings
-from rewire_jax.methods.base import Method, Spec, at, count, put, tile
+from rewire_jax.methods.base import Method, Spec
 from rewire_jax.nn import networks
 
 

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import require, settings, static
-from rewire_jax.methods.base import Method, Spec, count
+from rewire_jax.methods.base import Method, Spec
 from rewire_jax.nn import networks
 
 FREE = -1

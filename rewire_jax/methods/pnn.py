@@ -15,8 +15,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import require, settings
-from rewire_jax.methods.base import Method, Shared, Spec, at, count, put, tile
+from rewire_jax.methods.base import Method, Shared, Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 

@@ -9,19 +9,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.methods import wiring
-from rewire_jax.methods.base import (
-    Candidates,
-    Method,
-    Policy,
-    Purpose,
-    Selection,
-    Spec,
-    at,
-    count,
-    put,
-    tile,
-)
+from rewire_jax.methods.base import Candidates, Method, Policy, Purpose, Selection, Spec
 from rewire_jax.methods.rewire_losses import (
     Gaussian,
     alignment_loss,
@@ -252,9 +242,7 @@ def select_order(
         return jnp.argsort(params.scores[0], axis=-1), jnp.asarray(False)
     assert selection.before is not None  # The method sets `baseline`.
     valid = design.valid()
-    # NaN must not win, as it would in argmax.
-    valued = valid & ~jnp.isnan(selection.after)
-    after = jnp.where(valued, selection.after, -jnp.inf)
+    after = jnp.where(valid, selection.ranked, -jnp.inf)
     before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / design.modes
     chosen = choosing(design, state) * jnp.argmax(after)
     order = jnp.argsort(params.scores[chosen], axis=-1)

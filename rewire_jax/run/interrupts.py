@@ -18,17 +18,6 @@ class Stopped(Exception):
     """The run was interrupted and can be resumed; the message says how."""
 
 
-class Interrupt:
-    """What Ctrl-C asks of a run.
-
-    Attributes:
-      stopping: whether it is to stop after the running chunk.
-    """
-
-    def __init__(self) -> None:
-        self.stopping = False
-
-
 @contextmanager
 def noticed(act: Callable[[int], None]) -> Iterator[None]:
     """Calls `act(1)`, `act(2)`, ... at each Ctrl-C, from another thread.
@@ -64,12 +53,12 @@ def noticed(act: Callable[[int], None]) -> Iterator[None]:
 
 @contextmanager
 def interruptible(
-    interrupt: Interrupt, folder: Path, say: Callable[[str], None]
+    stopping: threading.Event, folder: Path, say: Callable[[str], None]
 ) -> Iterator[None]:
     """Ctrl-C once: stop after the running chunk. Twice: stop at once.
 
     Args:
-      interrupt: told of the first; the run looks at it after each chunk.
+      stopping: is set by the first; the run looks at it after each chunk.
       folder: folder of the run.
       say: tells the user.
 
@@ -78,9 +67,9 @@ def interruptible(
     """
 
     def handle(number: int, frame: Any) -> None:
-        if interrupt.stopping:
+        if stopping.is_set():
             raise KeyboardInterrupt
-        interrupt.stopping = True
+        stopping.set()
 
     def tell(times: int) -> None:
         if times == 1:

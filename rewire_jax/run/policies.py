@@ -17,8 +17,8 @@ from rewire_jax.run.run_state import saved
 from rewire_jax.run.sweep_grid import make_members
 from rewire_jax.run.sweep_members import Found
 from rewire_jax.storage import run_folder
+from rewire_jax.training import population
 from rewire_jax.training.acting import Act, Learned, act_function, mean_action
-from rewire_jax.training.population import Member, cross
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
 """`[..., observations]` -> actions `[..., actions]` in [-1, 1]."""
@@ -90,7 +90,7 @@ def load_policy(
         if member is not None:
             raise UserError(f"{folder} holds a run: give seed, not member")
         seed = settings.seed if seed is None else seed
-        owner = run_state.identity(settings, _members(settings))
+        owner = run_state.identity(settings, population.of_run(settings))
         options = settings.options
         place = seed - settings.seed
         found = Found(folder, stage, place, settings.seeds, ())
@@ -123,7 +123,7 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
     header, settings, spec = _read(folder, "run")
     method = find_method(settings.method).make(spec, settings.options)
 
-    members = _members(settings)
+    members = population.of_run(settings)
     owner = run_state.identity(settings, members)
     learned = _load(Found(folder, stage, 0, settings.seeds, ()), method, owner)
     seeds = tuple(member.seed for member in members)
@@ -135,12 +135,6 @@ def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
     """A folder's header, its settings and its sizes."""
     header, settings = saved(folder, kind)
     return header, settings, Spec(**header["spec"])
-
-
-def _members(settings: Settings) -> tuple[Member, ...]:
-    """The members of a run, one for each seed."""
-    seeds = range(settings.seed, settings.seed + settings.seeds)
-    return cross([(settings.sac, settings.options)], seeds)
 
 
 def _load(found: Found, method: Method, owner: Mapping[str, Any]) -> Learned:

@@ -173,10 +173,10 @@ class Sweep:
                     now = self.gather(stage, plan)
                 return run.start(now)
 
-            with interruptible(run.interrupt, folder, display.message):
+            with interruptible(run.stopping, folder, display.message):
                 # No variable holds the state, so that its memory can be freed.
                 run.task(start(), self.ahead(stage, number, len(batches)))
-            if run.interrupt.stopping:  # since the last chunk
+            if run.stopping.is_set():  # since the last chunk
                 raise Stopped
 
     def subject(self, member: Member) -> loggers.Subject:

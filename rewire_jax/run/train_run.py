@@ -1,6 +1,7 @@
 """A continual run: task after task, evaluation, logging, checkpoints."""
 
 import functools
+import threading
 import time as clock
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -16,7 +17,7 @@ from rewire_jax.envs.base import Task
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods.base import Selection
 from rewire_jax.run import loggers, run_state
-from rewire_jax.run.interrupts import Interrupt, Stopped, interruptible
+from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.recorder import Recorder
@@ -61,7 +62,7 @@ class Run:
         self.logs = logs or Loggers((), (), progress.message)
         self.recorder = Recorder(plan, folder, progress, self.logs)
         self.choosing = choosing
-        self.interrupt = Interrupt()
+        self.stopping = threading.Event()
 
     def start(self, now: RunState | None = None) -> RunState:
         """Starts the run: evaluates the untrained policies.
@@ -97,7 +98,7 @@ class Run:
         while now.steps < budget.steps + budget.offline_steps:
             offline = now.steps >= budget.steps
             now = self.offline_update(now) if offline else self.chunk(now, task)
-            if self.interrupt.stopping:
+            if self.stopping.is_set():
                 run_state.save(self.folder, now, self.plan)
                 raise Stopped(
                     f"stopped and saved: continue with --resume --out {self.folder}"
@@ -329,7 +330,7 @@ def train(
         ]
         logs = stack.enter_context(Loggers(log, subjects, display.message))
         run = Run(plan, folder, display, logs)
-        stack.enter_context(interruptible(run.interrupt, folder, display.message))
+        stack.enter_context(interruptible(run.stopping, folder, display.message))
         now = run_state.restore(folder, plan, display.message) if resume else None
         now = run.start(now)
         while now.stage < plan.settings.tasks:

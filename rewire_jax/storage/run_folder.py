@@ -251,8 +251,7 @@ def compare(folder: Path, settings: Settings, kind: str = "run") -> None:
 
 def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Adds rows to a table; `UserError` if it is a link or cannot be written."""
-    if (folder / table).is_symlink():
-        raise UserError(f"{folder / table} is a link: replace it by what it names")
+    _refuse_link(folder / table)
     text = "".join(json.dumps(row) + "\n" for row in rows)
     with writing(folder / table), (folder / table).open("a") as file:
         file.write(text)
@@ -297,8 +296,15 @@ def copies(folder: Path, marks: Mapping[str, Mark]) -> list[Path]:
 
 def check_own(path: Path) -> None:
     """Raises `UserError` if a folder that is to be written in is a link or a file."""
-    if path.is_symlink() or (path.exists() and not path.is_dir()):
+    _refuse_link(path)
+    if path.exists() and not path.is_dir():
         raise UserError(f"{path} is not a folder of this run: move it away")
+
+
+def _refuse_link(path: Path) -> None:
+    """Raises `UserError` for a link: nothing outside the folder is written."""
+    if path.is_symlink():
+        raise UserError(f"{path} is a link: replace it by what it names")
 
 
 def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
@@ -311,8 +317,7 @@ def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
         path = folder / table
         length, _ = _parts(marks.get(table, 0))
         with writing(path):
-            if path.is_symlink():
-                raise UserError(f"{path} is a link: replace it by what it names")
+            _refuse_link(path)
             if path.exists() and path.stat().st_size > length:
                 os.truncate(path, length)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from rewire_jax.core.settings import SacSettings
+from rewire_jax.core.settings import SacSettings, Settings
 
 _AXIS = "members"
 _LONGEST = 1_000  # bytes of a message between processes
@@ -57,6 +57,12 @@ def cross(
         Member(number, f"seed {seed}", seed, *pair)
         for number, (pair, seed) in enumerate(pairs)
     )
+
+
+def of_run(settings: Settings) -> tuple[Member, ...]:
+    """The members of a run, one for each seed."""
+    seeds = range(settings.seed, settings.seed + settings.seeds)
+    return cross([(settings.sac, settings.options)], seeds)
 
 
 _make_keys = jax.jit(jax.vmap(jax.random.key))

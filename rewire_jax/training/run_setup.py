@@ -8,11 +8,12 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import Settings, flag, require, validate
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.scenarios import Scenario, make_scenario
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Spec, count
+from rewire_jax.methods.base import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training import compiled_functions, population, train_loop
 from rewire_jax.training.compiled_functions import Program
@@ -110,8 +111,7 @@ def prepare(
       UserError: a setting is invalid.
     """
     settings, scenario = complete(settings, scenario)
-    seeds = range(settings.seed, settings.seed + settings.seeds)
-    members = members or population.cross([(settings.sac, settings.options)], seeds)
+    members = members or population.of_run(settings)
     filled = [*members, *[members[0]] * (num_slots - len(members))]
     mesh = population.mesh(len(filled))
     functions = make_functions(settings, scenario)

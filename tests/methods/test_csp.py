@@ -9,10 +9,11 @@ import pytest
 
 import rewire_jax
 from rewire_jax.core.errors import UserError
+from rewire_jax.core.pytrees import count
 from rewire_jax.core.transition import Batch
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import csp, csp_settings
-from rewire_jax.methods.base import Selection, Spec, Tools, count
+from rewire_jax.methods.base import Selection, Spec, Tools
 from rewire_jax.methods.csp_settings import CspSettings
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
