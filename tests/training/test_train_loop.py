@@ -13,6 +13,7 @@ from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.training import compiled_functions as compiled
 from rewire_jax.training import population, train_loop
+from rewire_jax.training.member_functions import MemberFunctions
 from tests.compiles import assert_once, compiles
 
 SCENARIO = make_scenario("probe/reach")
@@ -59,11 +60,9 @@ def configurations(method):
     return [(sac, options(method, n)) for n, sac in enumerate((PLAIN, OTHER))]
 
 
-def build(method):
-    make = find_method(method).make
-    return compiled.build(
-        SCENARIO.environment, make, SPEC, SHAPE, options(method, 0), MESH
-    )
+def build(method, environment=SCENARIO.environment, shape=SHAPE):
+    of = MemberFunctions(environment, find_method(method).make, SPEC, shape)
+    return compiled.build(of, options(method, 0), MESH)
 
 
 def crowd(method="ft1"):
@@ -363,11 +362,10 @@ def test_one_trace_for_all_tasks(method):
 
 def test_varied_environments_start_each_episode_from_a_reset_of_its_own():
     varied = SCENARIO.environment._replace(varied=True)
-    make = find_method("ft1").make
     shape = SHAPE._replace(transitions=70)
     programs = [
-        compiled.build(e, make, SPEC, shape, options("ft1", 0), MESH)
-        for e in (varied, SCENARIO.environment)
+        build("ft1", environment, shape)
+        for environment in (varied, SCENARIO.environment)
     ]
     length, members = varied.episode_length, crowd()
     states = [go(p, members, begin(p, members), [3 * length])[0] for p in programs]
