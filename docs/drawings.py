@@ -88,8 +88,8 @@ def alignment() -> Figure:
     n, random = 8, np.random.default_rng(3)
     before = [Linear(_smooth(n, phase), jnp.zeros(n)) for phase in (0.0, 1.0)]
     out, inp = random.permutation(n), random.permutation(n)
-    scores = wiring.spread(jnp.array([random.permutation(n), out]))
-    adapters = wiring.Adapters(scores, wiring.spread(jnp.array([inp])))
+    scores = wiring.scores_of(jnp.array([random.permutation(n), out]))
+    adapters = wiring.Adapters(scores, wiring.scores_of(jnp.array([inp])))
     noise = 0.05 * random.normal(size=(n, n))
     adapted = wiring.adapt(before, adapters, 0.1)
     now = [Linear(layer.weight + noise, layer.bias) for layer in adapted]

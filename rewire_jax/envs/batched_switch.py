@@ -29,11 +29,11 @@ def switch(functions: Sequence[Callable[..., Any]]) -> Callable[..., Any]:
 
     @chosen.def_vmap
     def batched(size, is_batched, index, *arguments):
-        def spread(leaf, has_axis):
+        def expand(leaf, has_axis):
             return leaf if has_axis else jnp.broadcast_to(leaf, (size, *leaf.shape))
 
         varied, *others = is_batched
-        arguments = jax.tree.map(spread, arguments, tuple(others))
+        arguments = jax.tree.map(expand, arguments, tuple(others))
         if varied:
             result = jax.lax.map(lambda turn: chosen(*turn), (index, *arguments))
         else:

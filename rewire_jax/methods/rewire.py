@@ -65,7 +65,7 @@ def init(design: Design, key: jax.Array) -> tuple[Params, State]:
     params = Params(
         hidden=hidden,
         heads=tile(head, design.slots),
-        scores=tile(wiring.spread(orders[0]), design.options.mode_slots),
+        scores=tile(wiring.scores_of(orders[0]), design.options.mode_slots),
         adapters=wiring.identity_adapters(depth, n),
     )
     return params, State(jnp.zeros((), jnp.int32), hidden, head, orders)
@@ -82,7 +82,7 @@ def start_task(
     return Params(
         hidden=params.hidden,
         heads=put(params.heads, task % design.slots, head),
-        scores=tile(wiring.spread(order), design.options.mode_slots),
+        scores=tile(wiring.scores_of(order), design.options.mode_slots),
         adapters=wiring.identity_adapters(design.spec.depth, design.n),
     ), state._replace(head=head)
 
@@ -279,7 +279,7 @@ def end_task(
     return Params(
         hidden=params.hidden,
         heads=params.heads,
-        scores=tile(wiring.spread(order), design.options.mode_slots),
+        scores=tile(wiring.scores_of(order), design.options.mode_slots),
         adapters=identity,
     ), State(
         learned=state.learned + 1,

@@ -35,7 +35,7 @@ class Adapters(NamedTuple):
     inp: jax.Array
 
 
-def spread(orders: jax.Array) -> jax.Array:
+def scores_of(orders: jax.Array) -> jax.Array:
     """Evenly spaced scores in [0, 1] that sort into the given orders, `[..., n]`."""
     ranks = jnp.argsort(orders, axis=-1)
     return ranks / max(orders.shape[-1] - 1, 1)

@@ -135,8 +135,8 @@ def compiled(
     )
     # Needed for one device, too. Without it, a function's results and the arrays from
     # `place` have different shardings, and a function is traced once for each.
-    spread = NamedSharding(mesh, P(_AXIS))
-    return jax.jit(local, donate_argnums=donate, out_shardings=spread)
+    by_member = NamedSharding(mesh, P(_AXIS))
+    return jax.jit(local, donate_argnums=donate, out_shardings=by_member)
 
 
 def over(

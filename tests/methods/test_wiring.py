@@ -69,11 +69,11 @@ def assert_trees_close(actual, expected, rtol=1e-10):
 
 def test_spread_sorts_into_its_order_evenly():
     orders = make_orders(np.random.default_rng(0), 2, 3)
-    scores = np.asarray(wiring.spread(jnp.asarray(orders)))
+    scores = np.asarray(wiring.scores_of(jnp.asarray(orders)))
     np.testing.assert_array_equal(np.argsort(scores, axis=-1), orders)
     even = np.broadcast_to(np.linspace(0, 1, N), scores.shape)
     np.testing.assert_allclose(np.sort(scores, axis=-1), even, rtol=1e-6)
-    np.testing.assert_array_equal(wiring.spread(jnp.zeros((2, 1), jnp.int32)), 0)
+    np.testing.assert_array_equal(wiring.scores_of(jnp.zeros((2, 1), jnp.int32)), 0)
 
 
 @pytest.mark.parametrize("batch", [BATCH, 2 * N])
