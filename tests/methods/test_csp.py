@@ -579,6 +579,7 @@ def searching(**options):
     return dataclasses.replace(settings, selection_episodes=1, options=options)
 
 
+@pytest.mark.slow
 def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
     scenario = make_scenario("probe/reach")
     settings = searching(resample_every=7)

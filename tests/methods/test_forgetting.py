@@ -3,9 +3,9 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -29,6 +29,7 @@ SCENARIO = make_scenario(ScenarioSpec("probe/corners", "reach", CHANGES, 1, 6400
 SEEDS = 3
 PULLED = ("ft_l2", "ewc")
 KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp")
+QUICK = ("ft1", "csp", "rewire")
 # Where the quick profile's values do not fit networks and budgets this small.
 OPTIONS: dict[str, dict] = {
     # At 1 the Fisher information of so few weights, so little trained, holds nothing.
@@ -38,6 +39,12 @@ OPTIONS: dict[str, dict] = {
     "pnn": {"width": 16},
     "csp": {"samples": 64, "estimations": 8},
 }
+
+
+def each(methods: Iterable[str]) -> list[Any]:
+    """The methods as parameters; half a minute each, so most are slow tests."""
+    marks = {method: () if method in QUICK else pytest.mark.slow for method in methods}
+    return [pytest.param(method, marks=mark) for method, mark in marks.items()]
 
 
 def settings(method: str) -> Settings:
@@ -119,7 +126,7 @@ def lost(scores: np.ndarray) -> np.ndarray:
     return -metrics.forgetting(scores[:, 1:])
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", each(METHODS))
 def test_tasks_are_learned(method: str, trained: Callable[[str], Trained]) -> None:
     before, after = costs(trained(method).scores)
     # What holds on to the first task is in the way of the others.
@@ -127,7 +134,7 @@ def test_tasks_are_learned(method: str, trained: Callable[[str], Trained]) -> No
     assert (after < before / 2)[:, :learned].all(), (before, after)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", each(METHODS))
 def test_finetuning_forgets_and_the_others_lose_less(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
@@ -145,7 +152,7 @@ def test_finetuning_forgets_and_the_others_lose_less(
         assert lost_here.mean() < 0.1 * lost(trained("ft1").scores).mean()
 
 
-@pytest.mark.parametrize("method", KEPT)
+@pytest.mark.parametrize("method", each(KEPT))
 def test_what_is_kept_stays_bit_for_bit(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
@@ -161,7 +168,7 @@ def test_what_is_kept_stays_bit_for_bit(
             assert np.abs(latest - actions).max() > 0.5
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", each(METHODS))
 def test_one_trace_for_all_tasks(
     method: str, trained: Callable[[str], Trained]
 ) -> None:

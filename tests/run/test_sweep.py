@@ -162,6 +162,7 @@ def alone(numbers: range, swept: Path, tmp_path: Path) -> None:
             )
 
 
+@pytest.mark.slow
 def test_a_member_is_what_it_is_alone(swept: Path, tmp_path: Path) -> None:
     alone(range(3, 24, 13), swept, tmp_path)
 
@@ -239,6 +240,7 @@ print(json.dumps({
 EIGHT = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
 
 
+@pytest.mark.slow
 def test_devices_train_their_members_without_a_word_to_each_other(
     swept: Path, tmp_path: Path
 ) -> None:
@@ -254,6 +256,7 @@ def test_devices_train_their_members_without_a_word_to_each_other(
     assert COLLECTIVE.search(found["control"])
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_batches(swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "sweep"
     processes = [begin(command(folder))]
@@ -300,6 +303,7 @@ def run_sweep(folder: Path, settings: Settings, **options) -> Path:
     return sweep.sweep(settings, folder, **options)
 
 
+@pytest.mark.slow
 def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
     # Seven members in slots for eight.
     sac = dataclasses.replace(small().sac, hidden=15)
@@ -311,6 +315,7 @@ def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
     assert {place[1] for place in rows(folder)} == set(range(7))
 
 
+@pytest.mark.slow
 def test_halving_keeps_the_best_configurations(tmp_path: Path) -> None:
     # Learning rates far apart, so that there is a better and a worse.
     settings = small(seeds=2, tasks=3, interactions=480)
@@ -534,6 +539,7 @@ def permuted_l2(spec: Spec, options: FtL2Settings) -> Method:
     )
 
 
+@pytest.mark.slow
 def test_one_mode_is_ft_l2_with_a_permutation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

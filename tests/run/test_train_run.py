@@ -195,6 +195,7 @@ def test_a_table_that_lost_rows_is_written_again(
     assert checkpoints(copy) == checkpoints(run)
 
 
+@pytest.mark.slow
 def test_one_trace_for_an_eight_task_scenario(tmp_path: Path) -> None:
     changes = [
         TaskChange(name, extra={"goal": goal})

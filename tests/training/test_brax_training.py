@@ -37,7 +37,13 @@ def train(prepared) -> None:
     assert not np.array_equal(first[0][0], first[0][1])  # seeds differ
 
 
-@pytest.mark.parametrize("domain", TASKS)
+@pytest.mark.parametrize(
+    "domain",
+    [
+        pytest.param(domain, marks=() if domain == "halfcheetah" else pytest.mark.slow)
+        for domain in TASKS
+    ],
+)
 def test_every_scenario_trains_through_all_its_tasks_in_one_program(domain) -> None:
     programs, counts = set(), Counter()
     names = [name for name in list_scenarios() if name.startswith(f"{domain}/")]

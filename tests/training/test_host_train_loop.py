@@ -357,6 +357,7 @@ def test_a_run_tells_of_success(tmp_path):
     assert all("success" in row and "success_last" in row for row in reports)
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_in_the_middle_of_an_episode(tmp_path):
     # Real simulators; the checkpoint lies within an episode of 200 steps.
     words = "continual_world/t3 --method ft1 --profile quick --tasks 2"
