@@ -95,9 +95,9 @@ def evaluate(
 
     Returns:
       A row for each member and task: task, name, seed (the member's), return, std (over
-      episodes), steps (of all episodes). If the environment defines success, also
-      success and success_last: the share of episodes solved at any step, and at the
-      last.
+      episodes), steps (of all episodes), diverged (whether the member is no longer
+      updated). If the environment defines success, also success and success_last: the
+      share of episodes solved at any step, and at the last.
 
     Raises:
       UserError: no such run or stage, or a damaged checkpoint.
@@ -113,9 +113,8 @@ def evaluate(
     plan = prepare(settings)
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = learner.params, learner.method_state
-    params, method_state = run_state.read_policies(
-        folder, stage, like, run_state.identity(plan.settings, plan.members)
-    )
+    owner = run_state.identity(plan.settings, plan.members)
+    (params, method_state), active = run_state.read_policies(folder, stage, like, owner)
     learner = plan.program.init(plan.stacked)._replace(
         params=params, method_state=method_state
     )
@@ -132,6 +131,7 @@ def evaluate(
             "return": float(returns[place, task].mean()),
             "std": float(returns[place, task].std()),
             "steps": int(lengths[place, task].sum()),
+            "diverged": not active[place],
         }
         | {name: float(x[place, task].mean()) for name, x in solved.items()}
         for place, member in enumerate(plan.members)

@@ -141,5 +141,5 @@ def _load(found: Found, method: Method, owner: Mapping[str, Any]) -> Learned:
     """What the members that trained together have learned, `[num_slots]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.num_slots))
     like = jax.eval_shape(jax.vmap(method.init), keys)
-    learned = run_state.read_policies(found.folder, found.stage, like, owner)
+    learned, _ = run_state.read_policies(found.folder, found.stage, like, owner)
     return Learned(*jax.tree.map(jnp.asarray, learned))
