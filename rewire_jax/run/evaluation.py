@@ -14,9 +14,12 @@ from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.run import run_state
 from rewire_jax.run.run_state import saved
 from rewire_jax.storage import run_folder
-from rewire_jax.training import rollout
+from rewire_jax.training import memory_estimate, rollout
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import base_size, make_spec, prepare
+
+_MOST_EPISODES = 2**20
+_others = jax.jit(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)))
 
 
 def info(scenario: Scenario) -> dict[str, Any]:
@@ -90,7 +93,8 @@ def evaluate(
     Args:
       run: folder of the run.
       stage: evaluate the policies from after this task's training; the latest if None.
-      episodes: number for each task and member.
+      episodes: number for each task and member; played in parts if the memory does
+        not hold all of them.
       seed: seed of the episodes.
 
     Returns:
@@ -102,7 +106,10 @@ def evaluate(
     Raises:
       UserError: no such run or stage, or a damaged checkpoint.
     """
-    require(episodes >= 1, f"--episodes must be at least 1, not {episodes}")
+    require(
+        1 <= episodes <= _MOST_EPISODES,
+        f"--episodes must be 1 to {_MOST_EPISODES}, not {episodes}",
+    )
     folder = Path(run)
     require(
         run_folder.kind(folder) == "run",
@@ -120,9 +127,15 @@ def evaluate(
     )
     policies = plan.program.policies(plan.stacked, learner)
     keys = jax.random.split(jax.random.key(seed), (plan.num_slots, len(plan.names)))
-    result = plan.program.rollout(plan.tasks, policies, keys, episodes)
-    returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
-    solved = {n: np.asarray(x) for n, x in rollout.named(result.success).items()}
+    at_once = memory_estimate.episodes_at_once(plan, policies, episodes)
+    parts = []
+    for part in range(-(-episodes // at_once)):
+        rolled = plan.program.rollout(plan.tasks, policies, keys, at_once)
+        parts.append(jax.tree.map(np.asarray, rolled))
+        keys = _others(keys, part)
+    result = jax.tree.map(lambda *x: np.concatenate(x, axis=2)[..., :episodes], *parts)
+    returns, lengths = result.returns, result.lengths
+    solved = rollout.named(result.success)
     return [
         {
             "task": task,

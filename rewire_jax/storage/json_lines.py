@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.errors import UserError, remedy
 
 T = TypeVar("T")
 
@@ -88,7 +88,8 @@ def raw(path: Path) -> bytes:
     except FileNotFoundError:
         raise UserError(f"{path} is missing: not the folder of a run") from None
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
+        told = f"cannot read {path}: {error.strerror}; {remedy(error.errno)}"
+        raise UserError(told) from None
 
 
 def number(value: float | None) -> float:
