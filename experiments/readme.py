@@ -21,6 +21,7 @@ RESULTS = Path("experiments/results")
 _BLOCK = re.compile(
     r"(<!-- results: (\S+)(?: \| ([^\n]*))? -->\n).*?(<!-- end -->)", re.DOTALL
 )
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _BETWEEN = re.compile(r"(?<!\\)\|")
 _FENCED = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 
@@ -42,7 +43,7 @@ def fill(text: str, page: Path = PAGES[0], results: Path = RESULTS) -> str:
         folder = results / name
         source = folder / "report.md" if folder.is_dir() else results / f"{name}.md"
         try:
-            report = source.read_text()
+            report = _COMMENT.sub("", source.read_text())
         except OSError as error:
             raise UserError(f"{page} names {name}: no {source}") from error
         if heads:

@@ -58,7 +58,7 @@ def write_run(
         }
 
     folder.mkdir(parents=True)
-    members = range(seed, seed + seeds)
+    first, members = seed, range(seed, seed + seeds)
     head = {
         "format": 1,
         "settings": {
@@ -83,9 +83,10 @@ def write_run(
             "stage": stage,
             "task": task,
             "name": tasks[task],
+            "member": seed - first,
             "seed": seed,
-            "return": float("nan")
-            if seed in diverged
+            "return": None
+            if seed in diverged and stage >= 0
             else float(scores[stage + 1, task] + GAP * seed),
             "episodes": 10,
             "interactions": {"training": BUDGET * (stage + 1), "selection": 77},
@@ -101,6 +102,7 @@ def write_run(
     training = [
         {
             "stage": stage,
+            "member": seed - first,
             "seed": seed,
             "interactions": x,
             "return": None,

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -68,6 +69,10 @@ def first(words: Sequence[str]) -> First:
     Raises:
       UserError: one of these flags has no value, or a wrong one.
     """
+    for before, word in itertools.pairwise(["", *words]):
+        name, equals, value = word.partition("=")
+        empty = not word or (word.startswith("--") and equals and not value)
+        require(not empty, f"{name or before or 'an argument'} has an empty value")
     known, _ = _parse(First, PROG, words, return_unknown_args=True, add_help=False)
     return known
 

@@ -173,6 +173,8 @@ class Evaluate(Flags):
                 f"{task:<28}{row['seed']:>6}{row['return']:>12.1f}{row['std']:>10.1f}"
                 f"{row['steps']:>10}{shares}"
             )
+        for seed in sorted({row["seed"] for row in rows if row["diverged"]}):
+            print(f"seed {seed} has diverged: its policy is from before that")
 
 
 @dataclass(frozen=True, kw_only=True)

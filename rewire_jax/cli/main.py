@@ -4,22 +4,27 @@ import contextlib
 import errno
 import io
 import os
+import re
 import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console
 
 from rewire_jax.cli import arguments
 from rewire_jax.core.compilation_cache import keep_compiled
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.errors import UserError, remedy
+from rewire_jax.core.machine_memory import address_limit
+from rewire_jax.core.settings import require
 from rewire_jax.run import interrupts
 from rewire_jax.version import __version__
 
 _INTERRUPTED = 130
 _PIPE_CLOSED = 141
+_LEAST_MEMORY = 2**31
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -31,6 +36,8 @@ def main(words: Sequence[str] | None = None) -> None:
     debug = "--debug" in words
     if not debug:
         sys.unraisablehook = _unraisable
+        # Orbax leaves coroutines behind where it fails.
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where a terminal knows ASCII only
@@ -55,6 +62,12 @@ def _run(words: Sequence[str]) -> None:
     if known.version:
         print(f"rewire_jax {__version__}")
         return
+    limit = address_limit()
+    require(
+        limit is None or limit >= _LEAST_MEMORY,  # With less, XLA aborts.
+        f"too little memory, {(limit or 0) / 1e6:.0f} MB: raise `ulimit -v` to "
+        f"{_LEAST_MEMORY // 1024} or more",
+    )
     keep_compiled(known.cache)
     arguments.command(words, known)()
 
@@ -95,8 +108,9 @@ def _unraisable(report: "sys.UnraisableHookArgs") -> None:
 
     Orbax closes its event loop when an array cannot be written, as on a full disk. Then
     TensorStore has no loop to tell of the other arrays, and says so for each of them.
+    Where too many files are open, a loop is closed that has no socket.
     """
-    if str(report.exc_value) != "Event loop is closed":
+    if not re.search("Event loop is closed|_ssock", str(report.exc_value)):
         sys.__unraisablehook__(report)
 
 
@@ -114,10 +128,14 @@ def _ending(error: BaseException) -> tuple[str, int]:
         stopped = isinstance(error.__context__, interrupts.Stopped)  # and then again
         return str(error.__context__) if stopped else "interrupted", _INTERRUPTED
     said = f"{type(error).__name__}: {error}".partition("\n")[0]
-    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in said:
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        return f"error: {error}: {remedy(error.errno)}", 2
+    no_memory = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    if no_memory or isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in said:
+        raised = "raise `ulimit -v`, or " if address_limit() else ""
         return (
-            "error: out of memory: lower --seeds, --envs, --buffer, --hidden or "
-            "--eval-episodes",
+            f"error: out of memory: {raised}lower --seeds, --envs, --buffer, --hidden "
+            "or --eval-episodes",
             2,
         )
     return (

@@ -34,16 +34,21 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     told = jax.config.values
     if not told["jax_enable_compilation_cache"]:
         return None
-    if folder is None and told["jax_compilation_cache_dir"]:
-        return Path(told["jax_compilation_cache_dir"])
+    theirs = None if folder else told["jax_compilation_cache_dir"]
     try:
-        folder = Path(folder or _default()).expanduser().absolute()
+        folder = Path(folder or theirs or _default()).expanduser().absolute()
+        if theirs and "://" in theirs:  # in a cloud
+            return Path(theirs)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, RuntimeError) as error:  # the latter: no home
-        print(f"cannot keep compiled programs for later: {error}", file=sys.stderr)
+        why = f"cannot keep compiled programs for later: {error}"
+        print(f"{why}; name another folder with --cache", file=sys.stderr)
+        jax.config.update("jax_compilation_cache_dir", None)
         return None
+    if theirs:
+        return folder
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # To load even the smallest function is faster than to compile it.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

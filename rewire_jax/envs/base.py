@@ -1,5 +1,6 @@
 """The interface of every environment: pure functions over pytrees."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -7,6 +8,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 
+from rewire_jax.core.errors import UserError
 from rewire_jax.envs.geom_trajectory import Film
 
 
@@ -126,6 +128,9 @@ class TaskChange:
       hidden: share of the observation entries that are masked to 0, by a fixed
         random choice.
       extra: values with a meaning in this domain only.
+
+    Raises:
+      UserError: a number is missing, NaN or infinite.
     """
 
     name: str
@@ -135,6 +140,18 @@ class TaskChange:
     actions: Mapping[str, float] = field(default_factory=dict)
     hidden: float = 0.0
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        given = {n: getattr(self, n) for n in ("gravity", "friction", "hidden")}
+        for name, value in {**given, **self.bodies, **self.actions}.items():
+            try:
+                finite = math.isfinite(value)
+            except TypeError:
+                finite = False
+            if not finite:
+                raise UserError(
+                    f"{name} of task {self.name!r} must be a finite number, not {value}"
+                )
 
 
 class Domain(NamedTuple):

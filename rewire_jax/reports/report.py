@@ -4,12 +4,14 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Generic, TypeVar
 
 from rich.console import Console
 from rich.text import Text
 
 from rewire_jax.core.errors import writing
+from rewire_jax.reports import own_files
 from rewire_jax.reports.table import Table, to_markdown, to_rich
 
 Numbers = TypeVar("Numbers", covariant=True)
@@ -61,16 +63,22 @@ class Report(Generic[Numbers]):
         return tuple(self.folder / name for name in names)
 
     def write(self) -> None:
-        """Writes all files; an old report is replaced.
+        """Writes all files; an old report is replaced when the new one is complete.
 
         Raises:
-            UserError: the folder cannot be written.
+            UserError: the folder cannot be written, or has a file of such a name that
+                is of no report.
         """
         with writing(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-            for name, text in {self.name: self._markdown(), **self.texts}.items():
-                (self.folder / name).write_text(text, encoding="utf-8")
-            self.draw(self.folder)
+            with TemporaryDirectory(dir=self.folder, prefix=".report-") as made:
+                new = Path(made)
+                for name, text in {self.name: self._markdown(), **self.texts}.items():
+                    (new / name).write_text(text, encoding="utf-8")
+                self.draw(new)
+                own_files.sign(new / self.name)
+                page, *others = self.paths
+                own_files.replace(page, others, new)
 
     def _markdown(self) -> str:
         notes = (f"**{note}**" for note in self.notes)

@@ -38,7 +38,8 @@ def write_report(
 
     Raises:
         UserError: a folder cannot be read or has no results yet, the runs are not
-            comparable, a task lacks its single-task run, or `out` cannot be written.
+            comparable, a task lacks its single-task run, or `out` cannot be written or
+            has files of these names that no report wrote.
     """
     known = ", ".join(SUCCESS)
     require(success in SUCCESS, f"unknown success {success!r}: choose one of {known}")

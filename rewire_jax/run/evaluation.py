@@ -14,9 +14,12 @@ from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.run import run_state
 from rewire_jax.run.run_state import saved
 from rewire_jax.storage import run_folder
-from rewire_jax.training import rollout
+from rewire_jax.training import memory_estimate, rollout
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import base_size, make_spec, prepare
+
+_MOST_EPISODES = 2**20
+_others = jax.jit(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)))
 
 
 def info(scenario: Scenario) -> dict[str, Any]:
@@ -90,19 +93,23 @@ def evaluate(
     Args:
       run: folder of the run.
       stage: evaluate the policies from after this task's training; the latest if None.
-      episodes: number for each task and member.
+      episodes: number for each task and member; played in parts if the memory does
+        not hold all of them.
       seed: seed of the episodes.
 
     Returns:
       A row for each member and task: task, name, seed (the member's), return, std (over
-      episodes), steps (of all episodes). If the environment defines success, also
-      success and success_last: the share of episodes solved at any step, and at the
-      last.
+      episodes), steps (of all episodes), diverged (whether the member is no longer
+      updated). If the environment defines success, also success and success_last: the
+      share of episodes solved at any step, and at the last.
 
     Raises:
       UserError: no such run or stage, or a damaged checkpoint.
     """
-    require(episodes >= 1, f"--episodes must be at least 1, not {episodes}")
+    require(
+        1 <= episodes <= _MOST_EPISODES,
+        f"--episodes must be 1 to {_MOST_EPISODES}, not {episodes}",
+    )
     folder = Path(run)
     require(
         run_folder.kind(folder) == "run",
@@ -113,17 +120,22 @@ def evaluate(
     plan = prepare(settings)
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = learner.params, learner.method_state
-    params, method_state = run_state.read_policies(
-        folder, stage, like, run_state.identity(plan.settings, plan.members)
-    )
+    owner = run_state.identity(plan.settings, plan.members)
+    (params, method_state), active = run_state.read_policies(folder, stage, like, owner)
     learner = plan.program.init(plan.stacked)._replace(
         params=params, method_state=method_state
     )
     policies = plan.program.policies(plan.stacked, learner)
     keys = jax.random.split(jax.random.key(seed), (plan.num_slots, len(plan.names)))
-    result = plan.program.rollout(plan.tasks, policies, keys, episodes)
-    returns, lengths = np.asarray(result.returns), np.asarray(result.lengths)
-    solved = {n: np.asarray(x) for n, x in rollout.named(result.success).items()}
+    at_once = memory_estimate.episodes_at_once(plan, policies, episodes)
+    parts = []
+    for part in range(-(-episodes // at_once)):
+        rolled = plan.program.rollout(plan.tasks, policies, keys, at_once)
+        parts.append(jax.tree.map(np.asarray, rolled))
+        keys = _others(keys, part)
+    result = jax.tree.map(lambda *x: np.concatenate(x, axis=2)[..., :episodes], *parts)
+    returns, lengths = result.returns, result.lengths
+    solved = rollout.named(result.success)
     return [
         {
             "task": task,
@@ -132,6 +144,7 @@ def evaluate(
             "return": float(returns[place, task].mean()),
             "std": float(returns[place, task].std()),
             "steps": int(lengths[place, task].sum()),
+            "diverged": not active[place],
         }
         | {name: float(x[place, task].mean()) for name, x in solved.items()}
         for place, member in enumerate(plan.members)

@@ -31,8 +31,11 @@ class Policies(NamedTuple):
       act: `(member, task, observation) -> action`. `member` is a `Learned`, `task` a
         `[]` int, `observation` `[..., observations]`. The action `[..., actions]` is in
         [-1, 1], without exploration. You can jit it, and vmap it over members, tasks
-        or both. It raises `AssertionError` for observations of another length.
-      members: values of all members, with a leading axis `[seeds]` on every leaf.
+        or both. It raises `AssertionError` for observations of another length, and
+        for what is not one member; `ValueError` for a task that is not there, unless
+        it is traced, when JAX takes the nearest.
+      members: values of all members, with a leading axis `[seeds]` on every leaf. JAX
+        takes the last member for an index that is too large: see `member`.
       seeds: seeds of the members, in the same order.
       tasks: names of the sequence.
     """
@@ -41,6 +44,12 @@ class Policies(NamedTuple):
     members: Learned
     seeds: tuple[int, ...]
     tasks: tuple[str, ...]
+
+    def member(self, seed: int) -> Learned:
+        """The member that was trained with a seed; `UserError` if there is none."""
+        require(seed in self.seeds, f"there is no seed {seed}: see `seeds`")
+        place = self.seeds.index(seed)
+        return jax.tree.map(lambda leaf: leaf[place], self.members)
 
 
 def load_policy(
@@ -141,5 +150,5 @@ def _load(found: Found, method: Method, owner: Mapping[str, Any]) -> Learned:
     """What the members that trained together have learned, `[num_slots]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.num_slots))
     like = jax.eval_shape(jax.vmap(method.init), keys)
-    learned = run_state.read_policies(found.folder, found.stage, like, owner)
+    learned, _ = run_state.read_policies(found.folder, found.stage, like, owner)
     return Learned(*jax.tree.map(jnp.asarray, learned))

@@ -170,7 +170,9 @@ class Recorder:
                     "training": interactions,
                     "selection": int(selection[place]),
                 },
-                "diverged": not bool(now.active[place]),
+                # A return can overflow although the parameters have not.
+                "diverged": not now.active[place]
+                or not all(np.isfinite(x[place, index]) for x in scores.values()),
                 "model_size": int(sizes[place]) / base_size(plan.spec),
             }
             | {name: _finite(float(x[place, index])) for name, x in scores.items()}

@@ -173,7 +173,7 @@ def _keep_copies(
 def _load(path: Path, plan: Plan) -> tuple[RunState, dict[str, run_folder.Mark]]:
     program, members = plan.program, plan.stacked
     learner = jax.eval_shape(program.init, members)
-    like: dict[str, Any] = {"counts": _counts(plan)}
+    like: dict[str, Any] = {"counts": _counts(plan.num_slots)}
     metadata = _facts(path, identity(plan.settings, plan.members))
     saved = metadata["items"]
     if "state" in saved:
@@ -208,7 +208,7 @@ def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
       CheckpointError: it is missing or damaged.
     """
     learner = jax.eval_shape(plan.program.init, plan.stacked)
-    like = {"counts": _counts(plan)} | _kept(learner)
+    like = {"counts": _counts(plan.num_slots)} | _kept(learner)
     path = folder / _FOLDER / _name(stage + 1)
     _facts(path, identity(plan.settings, plan.members))
     return checkpoint.load(path, like)[0]
@@ -216,7 +216,7 @@ def read_kept(folder: Path, stage: int, plan: Plan) -> dict[str, Any]:
 
 def read_policies(
     folder: Path, stage: int | None, like: Any, owner: Mapping[str, Any]
-) -> Any:
+) -> tuple[Any, np.ndarray]:
     """The policies kept after a stage, or after the latest one.
 
     Args:
@@ -226,15 +226,18 @@ def read_policies(
       owner: `identity` of the run.
 
     Returns:
-      The same, on the host.
+      The same, on the host; and `[members]` bool, which have not diverged.
 
     Raises:
       UserError: there are none, or they are damaged.
     """
     path = kept(folder, stage)
+    num_slots = len(jax.tree.leaves(like)[0])
     try:
         _facts(path, owner)
-        return checkpoint.load(path, {"policy": like})[0]["policy"]
+        wanted = {"policy": like, "counts": _counts(num_slots)}
+        items, _ = checkpoint.load(path, wanted)
+        return items["policy"], items["counts"]["active"]
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(
             f"{error}; delete it and newer checkpoints, and --resume trains that again"
@@ -283,10 +286,10 @@ def between(stage: int, items: dict[str, Any], plan: Plan) -> RunState:
     )
 
 
-def _counts(plan: Plan) -> dict[str, Any]:
+def _counts(num_slots: int) -> dict[str, Any]:
     return {
-        "active": jax.ShapeDtypeStruct((plan.num_slots,), bool),
-        "selection": jax.ShapeDtypeStruct((plan.num_slots,), jnp.int32),
+        "active": jax.ShapeDtypeStruct((num_slots,), bool),
+        "selection": jax.ShapeDtypeStruct((num_slots,), jnp.int32),
     }
 
 

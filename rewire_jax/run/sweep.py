@@ -26,7 +26,7 @@ import numpy as np
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
 from rewire_jax.core.settings import Settings, require, to_json, validate
-from rewire_jax.envs.scenarios import Scenario, make_scenario
+from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.run import loggers, run_state
 from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
@@ -37,7 +37,7 @@ from rewire_jax.run.sweep_grid import draws, grid, make_members, read, values_of
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
-from rewire_jax.training import memory_estimate
+from rewire_jax.training import memory_estimate, population
 from rewire_jax.training.population import Member
 from rewire_jax.training.run_setup import Plan, prepare
 
@@ -270,13 +270,14 @@ def sweep(
     validate(settings)
     loggers.check(log)
     given = {name: [float(x) for x in values] for name, values in (axes or {}).items()}
+    require(bool(given or configurations), "a sweep needs an axis: --alpha 0 1e-5")
+    every = len(configurations) or random or math.prod(map(len, given.values()))
+    plan = prepare(settings, scenario, population.of_run(settings)[:1])
+    memory_estimate.check_sweep(plan, every * settings.seeds, folder)
+    scenario = plan.scenario
     if not configurations:
-        require(bool(given), "a sweep needs an axis, such as --alpha 0 1e-5")
         configurations = draws(given, random, settings) if random else grid(given)
     settings, members = make_members(settings, configurations)
-    scenario = scenario or make_scenario(
-        settings.scenario, settings.backend, settings.reward
-    )
     plan = prepare(settings, scenario, members[:1])
     header = _header(
         plan, members, tuple(configurations[0]), given, random=random, halving=halving

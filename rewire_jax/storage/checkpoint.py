@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.errors import REMEDY, UserError
+from rewire_jax.core.errors import UserError, remedy
 from rewire_jax.version import __version__
 
 _FORMAT = 3
@@ -84,8 +84,8 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
         _sync(path.parent)
     except (OSError, ValueError) as error:  # TensorStore's are ValueErrors.
         raise UserError(
-            f"cannot write checkpoint {path}: {_reason(error)}; {REMEDY} (earlier "
-            "checkpoints are untouched)"
+            f"cannot write checkpoint {path}: {_reason(error)}; "
+            f"{remedy(_code(error))} (earlier checkpoints are untouched)"
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -271,27 +271,37 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 def _unreadable(path: Path, error: Exception) -> UserError:
     told = f"cannot read checkpoint {path}: {_reason(error)}"
-    if isinstance(error, OSError) and error.errno not in _MISSING:
+    if _code(error) not in _MISSING:
         # It may be whole: nobody should fall back from it.
-        return UserError(f"{told}; make it readable, and give the command again")
+        return UserError(f"{told}; {remedy(_code(error))}")
     return CheckpointError(told)
 
 
 def _foreign(path: Path, content: Any, why: str) -> ForeignError:
     known = content if isinstance(content, dict) else {}
     written = known.get("version", "of an unknown version")
+    if written != __version__:
+        why += f"; it was written by rewire_jax {written}, not {__version__}"
     return ForeignError(
-        f"checkpoint {path} does not fit rewire_jax {__version__}: {why}; it was "
-        f"written by rewire_jax {written}: use that version, or train in another folder"
+        f"checkpoint {path} does not fit: {why}: use what it was written with, or "
+        "train in another folder"
     )
 
 
+def _code(error: Exception) -> int | None:
+    """The error number; TensorStore hides it in a long text."""
+    if isinstance(error, OSError):
+        return error.errno
+    found = re.search(r"os_error_code='(\d+)'", str(error))
+    return int(found[1]) if found else None
+
+
 def _reason(error: Exception) -> str:
-    """One line; TensorStore hides the error number in a long text."""
+    """One line."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror} {error.filename or ''}".strip()
-    code = re.search(r"os_error_code='(\d+)'", str(error))
-    return os.strerror(int(code[1])) if code else str(error).partition("\n")[0]
+    code = _code(error)
+    return os.strerror(code) if code else str(error).partition("\n")[0]
 
 
 def _digest(content: Any) -> str:

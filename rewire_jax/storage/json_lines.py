@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.errors import UserError, remedy
 
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ def table(
     *,
     needed: bool = True,
 ) -> dict[tuple[int, ...], T]:
-    """Rows of a file by key; later rows replace earlier ones.
+    """Rows of a file by key.
 
     Args:
         path: the file.
@@ -38,17 +38,21 @@ def table(
         needed: otherwise a missing file is an empty table.
 
     Raises:
-        UserError: the file is missing, or damaged elsewhere than in its last line.
+        UserError: the file is missing, or damaged elsewhere than in its last line, or
+            has two rows of one key.
     """
     if not needed and not path.exists():
         return {}
     lines = text(path).split("\n")
-    rows = {}
+    rows: dict[tuple[int, ...], T] = {}
+    places: dict[tuple[int, ...], int] = {}
     # What follows the last line break is empty, or a line that was cut.
     for place, line in enumerate(lines[:-1], 1):
         with reading(f"{path}, line {place}"):
             key, value = parse(json.loads(line))
-            rows[key] = value
+            if key in rows:
+                raise ValueError(f"it repeats line {places[key]}")
+            rows[key], places[key] = value, place
     return rows
 
 
@@ -84,15 +88,8 @@ def raw(path: Path) -> bytes:
     except FileNotFoundError:
         raise UserError(f"{path} is missing: not the folder of a run") from None
     except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from None
-
-
-def index(row: dict[str, Any], name: str, low: int, high: int) -> int:
-    """A row's place on an axis, from `low` to below `high`, else `ValueError`."""
-    value = int(row[name])
-    if not low <= value < high:
-        raise ValueError(f"{name} {value} is not in {low} to {high - 1}")
-    return value
+        told = f"cannot read {path}: {error.strerror}; {remedy(error.errno)}"
+        raise UserError(told) from None
 
 
 def number(value: float | None) -> float:

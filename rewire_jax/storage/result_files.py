@@ -1,6 +1,6 @@
 """What the result files of a run and of a sweep share, and how they are read."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.storage import checkpoint, run_folder
-from rewire_jax.storage.json_lines import index, number, reading, table
+from rewire_jax.storage import checkpoint, fields, run_folder
+from rewire_jax.storage.json_lines import number, reading, table
 from rewire_jax.storage.scores import SUCCESS
 
 Array = NDArray[np.float64]
@@ -18,14 +18,13 @@ Flags = NDArray[np.bool_]
 Rows = dict[tuple[int, ...], dict[str, float]]
 """Values of evaluations by member, stage and task; -1 is the stage before training."""
 
-_SETTINGS = {
-    "scenario": str,
-    "method": str,
-    "profile": str,
-    "backend": str,
-    "interactions": int,
+_FACTS = {
+    "diverged": "diverged",
+    "model_size": "model_size",
+    "training": "interactions.training",
+    "selection": "interactions.selection",
 }
-_FACTS = ("diverged", "model_size", "training", "selection")
+"""What is the same in all rows of an evaluation of a member: names of the fields."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +75,10 @@ def read_header(folder: Path, kind: str) -> Results:
     header = run_folder.read_header(folder, kind)
     path = folder / run_folder.HEADER
     with run_folder.telling_version(folder, header), reading(path):
-        if not isinstance(header["tasks"], list):
-            raise ValueError("tasks are no list")
+        if not isinstance(header["tasks"], list) or not header["tasks"]:
+            raise ValueError("tasks are no list of names")
         dict(header["provenance"].get("versions", {}))  # as pages show them
+        fields.checked(header["settings"], fields.SETTINGS)
         results = Results(
             folder=folder,
             settings=dict(header["settings"]),
@@ -87,10 +87,6 @@ def read_header(folder: Path, kind: str) -> Results:
             episode_length=int(header["episode_length"]),
             header=header,
         )
-    of = results.settings.get
-    lacks = [name for name, kind in _SETTINGS.items() if not isinstance(of(name), kind)]
-    if lacks or not results.tasks:
-        raise UserError(f"{path} lacks {', '.join(lacks) or 'tasks'}")
     return results
 
 
@@ -110,10 +106,19 @@ def check_tables(folder: Path) -> None:
         return
 
 
+def check_member(row: Mapping[str, Any], seeds: Mapping[int, int]) -> int:
+    """The member of a row, by the seed of each; `ValueError` if there is none."""
+    member, seed = row["member"], row["seed"]
+    if seeds.get(member) != seed:
+        raise ValueError(f"there is no member {member} with seed {seed}")
+    return member
+
+
 def read_evaluations(
     path: Path,
-    tasks: int,
-    member: Callable[[dict[str, Any]], int],
+    names: Sequence[str],
+    seeds: Mapping[int, int],
+    stages: range,
     *,
     also: tuple[str, ...] = (),
     needed: bool = True,
@@ -122,24 +127,25 @@ def read_evaluations(
 
     Args:
         path: the file.
-        tasks: of the sequence.
-        member: whose row it is.
+        names: of the sequence's tasks.
+        seeds: of the members, by number.
+        stages: that it may hold.
         also: values that rows must have besides a run's.
         needed: otherwise a missing file has no rows.
 
     Raises:
         UserError: the file is missing, or damaged elsewhere than in its last line.
     """
+    known = fields.results(len(names), stages)
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], dict[str, float]]:
-        stage, task = index(row, "stage", -1, tasks), index(row, "task", 0, tasks)
+        row = fields.checked(row, known)
+        if row["name"] != names[row["task"]]:
+            raise ValueError(f"name is {row['name']}, not that of task {row['task']}")
         rates = [each.name for each in SUCCESS.values() if each.name in row]
-        spent = row["interactions"]
         values = {name: number(row[name]) for name in ("return", *rates, *also)}
-        facts = bool(row["diverged"]), float(row["model_size"])
-        counts = int(spent["training"]), int(spent["selection"])
-        values |= dict(zip(_FACTS, map(float, (*facts, *counts)), strict=True))
-        return (member(row), stage, task), values
+        values |= {name: float(row[field]) for name, field in _FACTS.items()}
+        return (check_member(row, seeds), row["stage"], row["task"]), values
 
     return table(path, parse, needed=needed)
 
@@ -156,27 +162,27 @@ def to_arrays(rows: Rows, members: Iterable[int], tasks: int) -> dict[str, Array
     return arrays
 
 
-def read_timing(path: Path, tasks: int, members: int, needed: bool) -> Timing:
+def read_timing(path: Path, stages: range, members: int, needed: bool) -> Timing:
     """What a `timing.jsonl` says.
 
     Args:
         path: the file.
-        tasks: of the sequence.
+        stages: that it may hold.
         members: trained together.
         needed: otherwise a missing file has no rows.
 
     Raises:
         UserError: the file is missing, or damaged elsewhere than in its last line.
     """
+    known = fields.timing(stages)
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], tuple[Any, ...]]:
+        row = fields.checked(row, known)
         # Updates after a task's last interaction have reports of their own.
-        updates = int(row.get("polishing", 0))
-        held: Mapping[str, Any] = {"process": 0} | row.get("memory", {})
-        where = "device" if "device" in held else "process"
-        key = index(row, "stage", 0, tasks), int(row["interactions"]), updates
-        took = float(row["seconds"]), bool(row["compile"])
-        return key, (*took, where, int(held[where]))
+        key = row["stage"], row["interactions"], row.get("polishing", 0)
+        where = "device" if "memory.device" in row else "process"
+        most = row.get(f"memory.{where}", 0)
+        return key, (row["seconds"], row["compile"], where, most)
 
     interactions, seconds, last = 0, 0.0, (0, 0)
     rows = table(path, parse, needed=needed)

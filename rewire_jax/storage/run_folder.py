@@ -200,19 +200,26 @@ def check_format(folder: Path, header: Any) -> None:
 
 @contextlib.contextmanager
 def telling_version(folder: Path, header: Any) -> Iterator[None]:
-    """A `UserError` inside also says which version wrote a folder, by its header."""
+    """A `UserError` inside also names the version that wrote a folder, if another."""
     try:
         yield
     except UserError as error:
-        try:
-            how = header["provenance"]
-            written = f"{how['versions']['rewire_jax']}, commit {how['commit']}"
-        except (KeyError, TypeError):
-            written = "of an unknown version"
-        raise UserError(
-            f"{folder} does not fit rewire_jax {__version__}: {error}; it was written "
-            f"by rewire_jax {written}: use that version, or train in another folder"
-        ) from error
+        raise UserError(f"{folder}: {error}{_other_version(header)}") from error
+
+
+def _other_version(header: Any) -> str:
+    """What to say of a folder that another version wrote, by its header."""
+    try:
+        how = header["provenance"]
+        version, commit = how["versions"]["rewire_jax"], how["commit"]
+    except (KeyError, TypeError):
+        version, commit = "of an unknown version", "unknown"
+    if version == __version__:
+        return ""
+    return (
+        f"; it was written by rewire_jax {version}, commit {commit}, not {__version__}:"
+        " use that version, or train in another folder"
+    )
 
 
 def kind(folder: Path) -> str:

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.storage.json_lines import index, number, table
+from rewire_jax.storage import fields
+from rewire_jax.storage.json_lines import number, table
 from rewire_jax.storage.result_files import (
     Array,
     Flags,
     Results,
+    check_member,
     check_tables,
     read_evaluations,
     read_header,
@@ -79,8 +81,7 @@ class RunData(Results):
 def read_run(folder: str | Path, success: Success = "any") -> RunData:
     """Reads a run, only from its folder.
 
-    The last line of a table may have been cut by a crash and is then ignored. A row
-    written again by a resumed run replaces the earlier one.
+    The last line of a table may have been cut by a crash and is then ignored.
 
     Args:
         folder: holds `settings.json`, `results.jsonl` and, once training has begun,
@@ -94,20 +95,22 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     head = read_header(Path(folder), "run")
     folder, tasks = head.folder, len(head.tasks)
     check_tables(folder)
-    path = folder / "results.jsonl"
-    rows = read_evaluations(path, tasks, lambda row: int(row["seed"]))
+    path, members = folder / "results.jsonl", _members(head)
+    rows = read_evaluations(path, head.tasks, members, range(-1, tasks))
     if not rows:
         raise UserError(f"{path} holds no results yet")
-    seeds = sorted({seed for seed, _, _ in rows})
-    values = to_arrays(rows, seeds, tasks)
+    found = sorted({member for member, _, _ in rows})
+    seeds = [members[member] for member in found]
+    values = to_arrays(rows, found, tasks)
     measured = {s: values[s.name] for s in SCORES if s.name in values}
     score = SUCCESS[success] if SUCCESS[success] in measured else RETURN
     whole = (~np.isnan(values["diverged"])).all(axis=(0, 2))
     finished = int(np.cumprod(whole)[1:].sum())
     diverged = (values["diverged"] == 1).any(axis=(1, 2))
-    trained = _curve(folder, tasks, seeds, finished > 0, score.training)
+    trained = _curve(head, seeds, finished > 0, score.training)
     steps = head.episode_length if score.stepwise else 1
-    timing = read_timing(folder / "timing.jsonl", tasks, len(seeds), finished > 0)
+    path = folder / "timing.jsonl"
+    timing = read_timing(path, range(tasks), len(seeds), finished > 0)
     return RunData(
         **vars(head),
         seeds=tuple(seeds),
@@ -134,22 +137,32 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
     Raises:
         UserError: the run does not report it, or its file is damaged.
     """
-    return _curve(run.folder, len(run.tasks), run.seeds, run.finished > 0, name)
+    return _curve(run, run.seeds, run.finished > 0, name)
+
+
+def _members(head: Results) -> dict[int, int]:
+    """The seed of each member."""
+    first, count = (head.settings[name] for name in ("seed", "seeds"))
+    return dict(enumerate(range(first, first + count)))
 
 
 def _curve(
-    folder: Path, tasks: int, seeds: Sequence[int], began: bool, name: str
+    head: Results, seeds: Sequence[int], began: bool, name: str
 ) -> tuple[tuple[Array, Array], ...]:
     """A value of the progress reports per stage, see `RunData.curve`."""
     place = {seed: i for i, seed in enumerate(seeds)}
+    members, stages = _members(head), range(len(head.tasks))
+    known = fields.training(stages)
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
-        at = index(row, "stage", 0, tasks), int(row["interactions"])
-        return (*at, place[row["seed"]]), number(row[name])
+        row = fields.checked(row, known, fields.OTHERS)
+        check_member(row, members)
+        key = row["stage"], row["interactions"], place[row["seed"]]
+        return key, number(row[name])
 
-    rows = table(folder / "training.jsonl", parse, needed=began)
+    rows = table(head.folder / "training.jsonl", parse, needed=began)
     curve = []
-    for stage in range(tasks):
+    for stage in stages:
         points = sorted({key[1] for key in rows if key[0] == stage})
         column = {x: i for i, x in enumerate(points)}
         values = np.full((len(place), len(points)), np.nan)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.storage.json_lines import document, index, reading
+from rewire_jax.storage.json_lines import document, reading
 from rewire_jax.storage.result_files import (
     Array,
     Flags,
@@ -92,8 +92,7 @@ class SweepData(Results):
 def read_sweep(folder: str | Path) -> SweepData:
     """Reads a sweep, only from its folder.
 
-    As in a run's tables, a last line that was cut is ignored, and a row written again
-    replaces the earlier one.
+    As in a run's tables, a last line that was cut is ignored.
 
     Args:
         folder: holds `settings.json`, and for each stage that has begun a folder
@@ -107,16 +106,18 @@ def read_sweep(folder: str | Path) -> SweepData:
     count, tasks = len(design["seeds"]), len(head.tasks)
     trained, hours = np.zeros((count, tasks), bool), 0.0
     rows: Rows = {}
-
-    def member(row: dict[str, Any]) -> int:
-        return index(row, "member", 0, count)
-
     for now, place, members in _batches(head.folder, count, tasks):
         trained[members, now] = True
         check_tables(place)
-        hours += read_timing(place / "timing.jsonl", tasks, len(members), False).hours
+        stages = range(now, now + 1)
+        hours += read_timing(place / "timing.jsonl", stages, len(members), False).hours
         rows |= read_evaluations(
-            place / "results.jsonl", tasks, member, also=("choice",), needed=False
+            place / "results.jsonl",
+            head.tasks,
+            {member: int(design["seeds"][member]) for member in members},
+            stages if now else range(-1, 1),  # before any training, too
+            also=("choice",),
+            needed=False,
         )
     values = to_arrays(rows, range(count), tasks)
     # What was before any training is left out.

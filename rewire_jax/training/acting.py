@@ -43,12 +43,14 @@ def mean_action(
 
 def act_function(method: Method, spec: Spec) -> Act:
     """How to act by what a method, made from this spec, has learned."""
+    like = Learned(*jax.eval_shape(method.init, jax.random.key(0)))
 
     def act(
         learned: Learned, task: jax.Array | int, observation: jax.Array
     ) -> jax.Array:
         if isinstance(task, int) and not 0 <= task < spec.tasks:
             raise ValueError(f"task must be 0 to {spec.tasks - 1}, not {task}")
+        chex.assert_trees_all_equal_shapes(learned, like)
         policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
         return mean_action(method, spec, policy, observation)
 

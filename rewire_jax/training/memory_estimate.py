@@ -8,10 +8,10 @@ it copies.
 
 import functools
 import math
-import os
 import resource
+import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,17 +20,21 @@ import jax.numpy as jnp
 from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
 
 from rewire_jax.core.errors import UserError
+from rewire_jax.core.machine_memory import machine_bytes
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import map_own
 from rewire_jax.training import colored_noise, rollout, train_loop
 from rewire_jax.training.run_setup import Plan
+from rewire_jax.training.time_estimate import least_years
 
 # Share of a device's memory; the rest is for compiled code and other programs.
 _SHARE = 0.8
 # With more members, a CPU's caches are too small and each member takes longer.
 _SIDE_BY_SIDE = 8
+_LISTED = 10_000  # bytes on the host for a member's settings, name and place
+_YEARS = 10
 
 
 class Need(NamedTuple):
@@ -77,9 +81,79 @@ def check(plan: Plan) -> None:
     room = _total(list(plan.mesh.devices.flat))
     require(
         room is None or held <= room,
-        f"a run of this size needs {held / 1e9:.3g} GB, but the memory has "
+        f"a run of this size needs {held / 1e9:.3g} GB and at least "
+        f"{least_years(plan, len(plan.members)):.2g} years, but the memory has "
         f"{(room or 0) / 1e9:.3g} GB: lower --seeds, --buffer, --envs or --hidden",
     )
+
+
+def check_sweep(plan: Plan, members: int, folder: Path) -> None:
+    """Raises `UserError` if nothing like this machine can train so many members.
+
+    Args:
+      plan: plan of any of them.
+      members: their number.
+      folder: folder of the sweep; it need not exist.
+    """
+    learner = jax.eval_shape(plan.program.init, plan.stacked)
+    kept = size((learner.params, learner.method_state, learner.critic))
+    kept *= plan.settings.tasks * members // plan.num_slots
+    listed, years = members * _LISTED, least_years(plan, members)
+    there = next(x for x in (folder, *folder.absolute().parents) if x.exists())
+    disk, memory = shutil.disk_usage(there).total, machine_bytes()
+    require(
+        kept <= disk and listed <= memory and years <= _YEARS,
+        f"a sweep of {members:,} members keeps {kept / 1e9:.3g} GB in {folder}, lists "
+        f"them in {listed / 1e9:.3g} GB of memory and takes at least {years:.2g} "
+        f"years; there are {disk / 1e9:.3g} GB, {memory / 1e9:.3g} GB and {_YEARS}: "
+        "give fewer values, --seeds or --random",
+    )
+
+
+def episodes_at_once(plan: Plan, policies: Any, episodes: int) -> int:
+    """How many of a member's episodes, in each task, the memory holds at once.
+
+    Args:
+      plan: plan of the run.
+      policies: `[members, tasks]`, or shapes.
+      episodes: how many are wanted; as many, or a part of them.
+
+    Raises:
+      UserError: not even one.
+    """
+    room = _total(list(plan.mesh.devices.flat))
+    if room is None:
+        return episodes
+    count = episodes
+    while plan.num_slots * _play(plan, policies, len(plan.names), count) > (
+        _SHARE * room
+    ):
+        require(count > 1, "the memory is too small for an episode of each member")
+        count = -(-count // 2)
+    return count
+
+
+def _cut(tree: Any, *shape: int, axes: int = 1) -> Any:
+    """Shapes whose first `axes` axes are replaced."""
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((*shape, *x.shape[axes:]), x.dtype), tree
+    )
+
+
+def _play(plan: Plan, policies: Any, rows: int, episodes: int) -> int:
+    """Bytes for a member's policies in `rows` tasks, with `episodes` of each."""
+    environment = plan.scenario.environment
+    policies = map_own(lambda x: _cut(x, 1, rows, axes=2), _cut(policies, 1))
+    if isinstance(environment, HostEnvironment):
+        return size(policies)  # episodes take nothing of the device
+    make = find_method(plan.settings.method).make
+    act = make(plan.spec, plan.settings.options).act
+
+    def roll(tasks, policies, keys):
+        return rollout.episodes(environment, act, tasks, policies, keys, episodes)
+
+    keys = _cut(plan.stacked.keys, 1, rows)
+    return size(policies) + peak(roll, _cut(plan.tasks, rows), policies, keys)
 
 
 def need(plan: Plan) -> Need:
@@ -101,32 +175,13 @@ def need(plan: Plan) -> Need:
             settings=member.sac,
         )
 
-    def cut(tree: Any, *shape: int, axes: int = 1) -> Any:
-        """Shapes whose first `axes` axes are replaced."""
-        return jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct((*shape, *x.shape[axes:]), x.dtype), tree
-        )
-
-    def play(policies: Any, rows: int, episodes: int) -> int:
-        """Bytes for a member's policies in `rows` tasks, with `episodes` of each."""
-        policies = map_own(lambda x: cut(x, 1, rows, axes=2), cut(policies, 1))
-        if isinstance(environment, HostEnvironment):
-            return size(policies)  # episodes take nothing of the device
-        act = make(spec, settings.options).act
-
-        def roll(tasks, policies, keys):
-            return rollout.episodes(environment, act, tasks, policies, keys, episodes)
-
-        keys = cut(plan.stacked.keys, 1, rows)
-        return size(policies) + peak(roll, cut(plan.tasks, rows), policies, keys)
-
-    member, mine = cut(plan.stacked), cut(state)
+    member, mine = _cut(plan.stacked), _cut(state)
     policies = jax.eval_shape(program.policies, plan.stacked, fresh)
     learner = size(mine.learner)
     work = [
         learner,  # a task's start and end each make one from the other
         peak(learn, member, mine),
-        play(policies, 1, settings.envs),
+        _play(plan, policies, 1, settings.envs),
     ]
     if program.consolidate:
         work.append(
@@ -135,7 +190,9 @@ def need(plan: Plan) -> Need:
     selection = 0
     if program.candidates and plan.budget.rows:
         chosen = jax.eval_shape(program.candidates, plan.stacked, fresh, 0)
-        selection = play(chosen.policies, plan.budget.rows, settings.selection_episodes)
+        selection = _play(
+            plan, chosen.policies, plan.budget.rows, settings.selection_episodes
+        )
     if program.baseline:
         work.append(selection)
     environments = size(mine.collection) - size(mine.collection.buffer)
@@ -155,7 +212,7 @@ def need(plan: Plan) -> Need:
         environments=environments,
         work=max(work),
         evaluation=max(
-            play(policies, settings.tasks, settings.eval_episodes), selection
+            _play(plan, policies, settings.tasks, settings.eval_episodes), selection
         ),
     )
 
@@ -233,45 +290,6 @@ def most_held() -> dict[str, int]:
     stats = [device.memory_stats() or {} for device in jax.local_devices()]
     peaks = [each["peak_bytes_in_use"] for each in stats if "peak_bytes_in_use" in each]
     return held | ({"device": sum(peaks)} if peaks else {})
-
-
-def machine_bytes(root: Path = Path("/")) -> int:
-    """Bytes of the machine's memory, or of this process's share of it (cgroups).
-
-    Args:
-      root: root of the file system.
-    """
-    pages, page = os.sysconf("SC_PHYS_PAGES"), os.sysconf("SC_PAGE_SIZE")
-    return min([pages * page, *_limits(root)])
-
-
-def _limits(root: Path) -> Iterator[int]:
-    """Limits of the process's control groups, in both versions of cgroups."""
-    try:
-        groups = (root / "proc/self/cgroup").read_text().splitlines()
-    except OSError:  # not Linux
-        return
-    for group in groups:
-        _, controllers, path = group.split(":", 2)
-        if "memory" in controllers.split(","):
-            top, name = root / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
-        elif not controllers:
-            top, name = root / "sys/fs/cgroup", "memory.max"
-        else:
-            continue
-        inner = top / path.lstrip("/")
-        for folder in (inner, *inner.parents):
-            # In a container, the path may be that of the machine outside.
-            text = _text(folder / name)
-            if text.isdecimal():  # not "max"
-                yield int(text)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""
 
 
 def fitting(each: Need, devices: Sequence[jax.Device]) -> int:

@@ -140,7 +140,7 @@ def complete(
     """Returns checked, complete settings and their scenario.
 
     Raises:
-      UserError: a setting is invalid.
+      UserError: a setting is invalid, or a task has NaN.
     """
     validate(settings)
     options = find_method(settings.method).settings
@@ -160,6 +160,12 @@ def complete(
         settings.tasks <= len(scenario.tasks),
         f"--tasks {settings.tasks}: {scenario.name} has {len(scenario.tasks)}",
     )
+    for task in scenario.tasks[: settings.tasks]:
+        for path, leaf in jax.tree.leaves_with_path(task.data):
+            require(
+                not np.isnan(leaf).any(),
+                f"task {task.name!r} has NaN in its {jax.tree_util.keystr(path)}",
+            )
     return settings, scenario
 
 

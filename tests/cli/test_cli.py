@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import shutil
@@ -28,6 +29,7 @@ TINY = {
     "--hidden": 8,
     "--batch-size": 8,
 }
+LIST = [sys.executable, "-m", "rewire_jax.cli.main", "list"]
 TINY = [str(word) for pair in TINY.items() for word in pair]
 
 
@@ -100,6 +102,10 @@ def test_bad_settings(
         ("sweep probe/reach --out x --axis tau", "--axis"),
         ("sweep probe/reach --out x --axis tau high", "--axis"),
         ("sweep probe/reach --out x --k 1 --axis modes 2", "modes"),
+        ("train probe/reach --out=", "--out"),
+        ("report --out= x", "--out"),
+        ("evaluate x --episodes 999999999999", "--episodes"),
+        ("sweep probe/reach --out x --axis tau 1 9 --random 999999999999", "--random"),
     ],
 )
 def test_bad_arguments(
@@ -274,6 +280,32 @@ def test_too_little_memory_is_told(
     assert "--seeds" in fails(capsys, "list")
 
 
+LIMITS = {
+    "open files": (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
+    "memory": (OSError(errno.ENOMEM, "Cannot allocate memory"), "--envs"),
+}
+
+
+@pytest.mark.parametrize(("error", "told"), LIMITS.values(), ids=LIMITS)
+def test_a_limit_of_the_system_is_no_bug(
+    error: OSError,
+    told: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    breaks(monkeypatch, error)
+    assert told in fails(capsys, "list")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits are those of Linux")
+def test_too_little_memory_to_begin_with_is_told() -> None:
+    words = ["sh", "-c", 'ulimit -v 800000; exec "$@"', "sh", *LIST]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "ulimit -v" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_an_interruption_shows_no_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -289,9 +321,6 @@ def test_nothing_is_imported_upward() -> None:
     assert "rewire_jax.cli.main" in sys.modules
     assert sorted(rewire_jax.__all__) == rewire_jax.__all__
     assert all(hasattr(rewire_jax, name) for name in rewire_jax.__all__)
-
-
-LIST = [sys.executable, "-m", "rewire_jax.cli.main", "list"]
 
 
 def test_a_reader_that_has_gone_is_no_error() -> None:

@@ -84,11 +84,19 @@ def test_damage_stops_nothing(filled, tmp_path, damage):
 
 
 def test_folder_that_cannot_be_written_stops_nothing(tmp_path):
-    (tmp_path / "file").touch()
-    _, hits, misses, error = finish(start(tmp_path / "file"))
-    assert (hits, misses) == (0, 0)
-    assert error.count("\n") == 1
-    assert str(tmp_path / "file") in error
+    file = tmp_path / "file"
+    file.touch()
+    processes = [
+        start(file),
+        start(tmp_path, str(file)),
+        start(tmp_path, JAX_COMPILATION_CACHE_DIR=str(file)),
+    ]
+    for process in processes:
+        _, hits, misses, error = finish(process)
+        assert (hits, misses) == (0, 0)
+        assert error.count("\n") == 1
+        assert str(file) in error
+        assert "--cache" in error
 
 
 def test_other_folder_or_none(tmp_path):

@@ -2,7 +2,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from rewire_jax.envs.base import State, check_state
+from rewire_jax.core.errors import UserError
+from rewire_jax.envs.base import State, TaskChange, check_state
 from rewire_jax.envs.probe import make_domain
 
 ENVIRONMENT = make_domain("reach").environment
@@ -33,3 +34,19 @@ def test_success_is_looked_at_where_it_is_known():
     check_state(knowing, RIGHT._replace(success=jnp.zeros((), bool)))
     with pytest.raises(AssertionError):
         check_state(knowing, RIGHT._replace(success=jnp.zeros(2, bool)))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "heavy"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x: {"gravity": x},
+        lambda x: {"friction": x},
+        lambda x: {"hidden": x},
+        lambda x: {"bodies": {"torso": x}},
+        lambda x: {"actions": {"*": x}},
+    ],
+)
+def test_a_change_is_of_finite_numbers(change, value) -> None:
+    with pytest.raises(UserError, match="odd"):
+        TaskChange("odd", **change(value))

@@ -68,7 +68,8 @@ def fake(folder: Path, values: np.ndarray, **kept) -> list[suite.Run]:
             **kept,
         )
         told = [
-            {"stage": 0, "seed": seed, "interactions": int(x), "reward": value / 10}
+            {"stage": 0, "member": 0, "seed": seed, "interactions": int(x)}
+            | {"reward": value / 10}
             for x, value in zip(X, each, strict=True)
         ]
         lines = "".join(json.dumps(row) + "\n" for row in told)

@@ -1,6 +1,7 @@
 """Checkpoints and tables that are not those of the run in whose folder they are."""
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -97,6 +98,20 @@ def test_a_task_that_is_not_there(task: int, trained: Path) -> None:
     assert policies.act(learned, 1, jnp.zeros(2)).shape == (2,)
 
 
+def test_a_member_that_is_not_there(trained: Path) -> None:
+    policies = rewire_jax.load_policies(trained)
+    last = policies.member(policies.seeds[-1])
+    whole = jax.tree.map(lambda leaf: leaf[-1], policies.members)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, last, whole))
+    with pytest.raises(rewire_jax.UserError, match="seed"):
+        policies.member(policies.seeds[-1] + 1)
+    # All members are no member; vmap makes one of each.
+    with pytest.raises(AssertionError):
+        policies.act(policies.members, 0, jnp.zeros(2))
+    every = jax.vmap(policies.act, (0, None, None))(policies.members, 0, jnp.zeros(2))
+    assert every.shape == (len(policies.seeds), 2)
+
+
 def test_an_older_checkpoint_does_not_take_the_latests_place(run: Path) -> None:
     (run / "checkpoints/task-002/manifest.json").unlink()
     with pytest.raises(UserError, match="task-002"):
@@ -104,7 +119,7 @@ def test_an_older_checkpoint_does_not_take_the_latests_place(run: Path) -> None:
 
 
 def test_a_report_refuses_rows_that_the_run_did_not_write(
-    run: Path, trained: Path, tmp_path: Path
+    run: Path, tmp_path: Path
 ) -> None:
     rewire_jax.write_report([run], tmp_path / "report")
     held = rows(run)
@@ -118,8 +133,9 @@ def test_a_report_refuses_rows_that_the_run_did_not_write(
     rewire_jax.train(small(), run, resume=True)
     rewire_jax.write_report([run], tmp_path / "report")
     # Rows that came after the checkpoint are those of a run that goes on.
-    with (run / "results.jsonl").open("ab") as table:
-        table.write(rows(trained).splitlines(keepends=True)[-1])
+    row = json.loads((run / "timing.jsonl").read_text().splitlines()[-1])
+    with (run / "timing.jsonl").open("a") as table:
+        table.write(json.dumps(row | {"interactions": row["interactions"] + 16}) + "\n")
     rewire_jax.write_report([run], tmp_path / "report")
 
 

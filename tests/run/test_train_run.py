@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import rewire_jax
+from rewire_jax.cli import main
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import TaskChange
@@ -306,7 +307,10 @@ def test_evaluate_replays_a_run(run: Path) -> None:
 
 
 def test_a_frozen_seed_is_marked_and_the_other_goes_on(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     begin = train_run.Run.begin
 
@@ -323,6 +327,10 @@ def test_a_frozen_seed_is_marked_and_the_other_goes_on(
     train_run.train(tiny(), tmp_path / "run")
     marked = {(r["stage"], r["seed"]) for r in rows(tmp_path / "run") if r["diverged"]}
     assert marked == {(1, 0), (2, 0), (3, 0)}
+    # `evaluate` names it, too.
+    main.main(["evaluate", str(tmp_path / "run"), "--episodes", "1"])
+    said = capsys.readouterr().out.splitlines()
+    assert [line[:6] for line in said if "diverged" in line] == ["seed 0"]
     # The other seed is what it was, but for the order of float sums.
     for ours, theirs in zip(rows(tmp_path / "run"), rows(run), strict=True):
         if ours["seed"] == 1:

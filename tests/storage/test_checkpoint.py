@@ -211,7 +211,7 @@ def test_what_may_be_whole_is_not_called_damaged(
 
     locked = PermissionError(errno.EACCES, "Permission denied", "x")
     monkeypatch.setattr(checkpoint, "_read_item", failing(locked))
-    with pytest.raises(UserError, match=r"Permission denied.*readable") as caught:
+    with pytest.raises(UserError, match=r"Permission denied.*permissions") as caught:
         load(saved, POLICY)
     assert not isinstance(caught.value, CheckpointError)
     monkeypatch.setattr(checkpoint, "_read_item", failing(MemoryError()))

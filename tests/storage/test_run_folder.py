@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.errors import UserError, writing
 from rewire_jax.core.settings import to_json
 from rewire_jax.run import run_state
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.run_folder import HEADER, held
+from rewire_jax.version import __version__
 from tests.tiny import tiny
 
 HEAD = {"settings": to_json(tiny()), "provenance": {"versions": {}, "commit": "abc"}}
@@ -104,14 +105,33 @@ def test_nothing_is_left_where_something_else_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("code", "told", "not_told"),
+    [
+        (errno.ENOSPC, "free space", "ulimit"),
+        (errno.EDQUOT, "free space", "ulimit"),
+        (errno.EROFS, "writable", "free space"),
+        (errno.EACCES, "permissions", "free space"),
+        (errno.EMFILE, "ulimit -n", "free space"),
+        (errno.ENFILE, "ulimit -n", "free space"),
+    ],
+)
+def test_what_helps_depends_on_what_failed(
+    code: int, told: str, not_told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=told) as caught, writing(tmp_path):
+        raise OSError(code, os.strerror(code), str(tmp_path))
+    assert not_told not in str(caught.value)
+
+
+@pytest.mark.parametrize(
     ("change", "said"),
     [
         (
             lambda head: head["settings"].update(lookahead=1),
             "unknown setting lookahead",
         ),
-        (lambda head: head["settings"]["sac"].update(a=1), "unknown setting a;"),
-        (lambda head: head["settings"].pop("tasks"), "no setting tasks;"),
+        (lambda head: head["settings"]["sac"].update(a=1), "unknown setting a"),
+        (lambda head: head["settings"].pop("tasks"), "no setting tasks"),
         (lambda head: head.update(format=7), "format 7, not 1"),
     ],
 )
@@ -121,6 +141,7 @@ def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> No
     for versions, named in (
         ({"rewire_jax": "9.8"}, "written by rewire_jax 9.8, commit abc"),
         ({}, "written by rewire_jax of an unknown version"),
+        ({"rewire_jax": __version__}, ""),
     ):
         head["provenance"]["versions"] = versions
         (tmp_path / HEADER).write_text(json.dumps(head))
@@ -131,6 +152,8 @@ def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> No
             with pytest.raises(UserError, match=said) as caught:
                 read()
             assert named in str(caught.value)
+            # Only where another version wrote it is that of interest.
+            assert bool(named) == ("written by" in str(caught.value))
 
 
 def test_what_was_written_since_is_cut_off(tmp_path: Path) -> None:

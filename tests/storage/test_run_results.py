@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_damaged_line_is_named(tmp_path: Path, name: str, text: str) -> None:
 def test_damaged_settings(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run") / "settings.json"
     path.write_text(path.read_text().replace("backend", "back"))
-    with pytest.raises(UserError, match=r"settings\.json lacks backend"):
+    with pytest.raises(UserError, match=r"settings\.json is damaged .*'backend'"):
         read_run(path.parent)
     path.write_text(path.read_text()[:50])
     with pytest.raises(UserError, match=r"settings\.json is damaged"):
@@ -52,15 +53,80 @@ def test_half_written_stage_does_not_count(tmp_path: Path) -> None:
     assert read_run(run).finished == 2
 
 
-def test_rewritten_rows_replace_earlier_ones(tmp_path: Path) -> None:
-    run = write_run(tmp_path / "run")
-    whole = read_run(run)
-    for name in ("results", "training", "timing"):
-        path = run / f"{name}.jsonl"
-        path.write_text(path.read_text() * 2)
-    again = read_run(run)
-    np.testing.assert_array_equal(again.scores, whole.scores)
-    assert again.rate == whole.rate
+@pytest.mark.parametrize("name", ["results", "training", "timing"])
+def test_a_row_that_is_there_twice_is_named(tmp_path: Path, name: str) -> None:
+    path = write_run(tmp_path / "run") / f"{name}.jsonl"
+    lines = path.read_text().splitlines()
+    replace_line(path, 3, lines[1])
+    with pytest.raises(UserError, match=f"{name}.jsonl, line 3 is damaged .*line 2"):
+        read_run(path.parent)
+
+
+WRONG: dict[str, list[tuple[str, Any]]] = {
+    "results": [
+        ("stage", True),
+        ("stage", 0.0),
+        ("task", 1),  # whose name is another
+        ("name", "moon"),
+        ("name", 7),
+        ("seed", 1),
+        ("member", 1),
+        ("member", "0"),
+        ("episodes", 0),
+        ("interactions", {"training": -1, "selection": 0}),
+        ("interactions", {"training": 0}),
+        ("interactions", 7),
+        ("diverged", 0),
+        ("model_size", "1"),
+        ("model_size", float("nan")),
+        ("return", None),  # of a member that did not diverge
+        ("return", float("nan")),
+        ("return", float("inf")),
+        ("return", "1"),
+        ("return", True),
+        ("success", 1.5),
+    ],
+    "training": [
+        ("stage", -1),
+        ("seed", 9),
+        ("interactions", -1),
+        ("interactions", 0.5),
+        ("reward", float("inf")),
+        ("critic_loss", "small"),
+        ("success_last", -0.1),
+    ],
+    "timing": [
+        ("stage", 3),
+        ("seconds", -1.0),
+        ("seconds", float("nan")),
+        ("compile", 1),
+        ("polishing", -1),
+        ("memory", {"process": -1}),
+        ("memory", {"device": 0.5}),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value"),
+    [(name, *wrong) for name, fields in WRONG.items() for wrong in fields],
+)
+def test_a_field_that_cannot_be_is_named(
+    tmp_path: Path, name: str, field: str, value: Any
+) -> None:
+    path = write_run(tmp_path / "run") / f"{name}.jsonl"
+    row = json.loads(path.read_text().splitlines()[0]) | {field: value}
+    replace_line(path, 1, json.dumps(row))
+    with pytest.raises(UserError, match=f"{name}.jsonl, line 1 .*{field}") as error:
+        read_run(path.parent)
+    assert "\n" not in str(error.value)
+
+
+def test_a_diverged_seed_may_have_no_return(tmp_path: Path) -> None:
+    path = write_run(tmp_path / "run") / "results.jsonl"
+    row = json.loads(path.read_text().splitlines()[0])
+    replace_line(path, 1, json.dumps(row | {"return": None, "diverged": True}))
+    assert read_run(path.parent).diverged == (0,)
 
 
 def test_updates_after_the_last_interaction_count_in_hours_but_not_in_the_rate(

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import pytest
 
 import rewire_jax
+from rewire_jax.core.machine_memory import machine_bytes
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage.run_results import read_run
-from rewire_jax.training.memory_estimate import machine_bytes, size
+from rewire_jax.training.memory_estimate import size
 from rewire_jax.training.run_setup import prepare
 from tests.tiny import tiny
 

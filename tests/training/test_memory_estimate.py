@@ -14,6 +14,7 @@ from rewire_jax.methods import METHODS
 from rewire_jax.training import memory_estimate
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import Plan, prepare
+from rewire_jax.training.time_estimate import least_years
 from tests.tiny import tiny
 
 FOUR = 4  # bytes of a number
@@ -205,31 +206,33 @@ def test_devices_of_a_cpu_share_the_machine(monkeypatch):
     assert memory_estimate.fitting(need, cpus) == 32
 
 
-@pytest.mark.parametrize(
-    ("groups", "file", "text", "limit"),
-    [
-        ("0::/user/me", "sys/fs/cgroup/user/memory.max", "1000000", 1_000_000),
-        ("0::/user/me", "sys/fs/cgroup/user/memory.max", "max", None),
-        ("0::/outside", "sys/fs/cgroup/memory.max", "1000000", 1_000_000),
-        (
-            "5:cpu:/\n4:cpuset,memory:/me",
-            "sys/fs/cgroup/memory/me/memory.limit_in_bytes",
-            "1000000",
-            1_000_000,
-        ),
-        ("5:cpu:/me", "sys/fs/cgroup/memory/me/memory.limit_in_bytes", "1000", None),
-    ],
-)
-def test_machine_gives_no_more_than_its_control_groups(
-    tmp_path: Path, groups, file, text, limit
-):
-    whole = memory_estimate.machine_bytes(tmp_path)
-    assert whole > 1e8
-    for name, written in (("proc/self/cgroup", groups), (file, text)):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(written + "\n")
-    assert memory_estimate.machine_bytes(tmp_path) == (limit or whole)
+def test_a_sweep_that_no_machine_can_train_is_refused(tmp_path: Path) -> None:
+    plan = prepare(settings(seeds=1))
+    memory_estimate.check_sweep(plan, 1000, tmp_path / "new" / "sweep")
+    with pytest.raises(UserError, match=r"1,000,000,000 members .* GB .* years"):
+        memory_estimate.check_sweep(plan, 10**9, tmp_path / "new" / "sweep")
+    assert not (tmp_path / "new").exists()
+
+
+def test_years_are_those_of_the_updates() -> None:
+    one, other = (prepare(settings(updates=n)) for n in (4, 8))
+    years = least_years(one, 1)
+    assert 0 < years < 1e-6
+    assert least_years(one, 7) == pytest.approx(7 * years)
+    assert least_years(other, 1) == pytest.approx(2 * years)
+
+
+def test_episodes_are_played_in_parts_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = prepare(tiny(method="ft1"))
+    learner = jax.eval_shape(plan.program.init, plan.stacked)
+    policies = jax.eval_shape(plan.program.policies, plan.stacked, learner)
+    assert memory_estimate.episodes_at_once(plan, policies, 50) == 50
+    monkeypatch.setattr(memory_estimate, "machine_bytes", lambda: 1_000_000)
+    many = memory_estimate.episodes_at_once(plan, policies, 100_000)
+    assert 1 < many < 100_000
+    monkeypatch.setattr(memory_estimate, "machine_bytes", lambda: 100)
+    with pytest.raises(UserError, match="memory"):
+        memory_estimate.episodes_at_once(plan, policies, 100)
 
 
 def test_table_of_needs_has_what_is_counted():
