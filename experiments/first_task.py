@@ -164,7 +164,7 @@ def read(
         ]
         kept = [data for data in datas if data.kept.all()]
         if kept:
-            found[name] = _gather(label, kept, value)
+            found[name] = gather(label, kept, value)
             settings, tasks = kept[0].settings, len(kept[0].tasks)
         if datas:
             origins.append(origin(label, *datas))
@@ -177,7 +177,7 @@ def read(
     return Evolution(heading(subject, settings, tasks, seeds), found, origins)
 
 
-def _gather(label: str, kept: Sequence[RunData], value: str | None) -> Trained:
+def gather(label: str, kept: Sequence[RunData], value: str | None = None) -> Trained:
     """Runs of one variant as one."""
     parts = [(read_progress(run, value) if value else run.curve)[0] for run in kept]
     # A run that was stopped may have reports in between.

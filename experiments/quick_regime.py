@@ -1,16 +1,15 @@
 """Which short regime learns to run: FT-1 on the first task, one regime a row.
 
-A regime is a number of environments, of interactions and of updates, a batch and some
-of SAC's settings. Used to choose the quick profile's values.
+A regime changes the quick profile: its environments, interactions, updates, and some of
+SAC's settings. The table shows which budget a policy needs to stand up.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from experiments import suite
+from experiments import first_task, suite
+from experiments.first_task import Trained
 from rewire_jax.core.formatting import number
 from rewire_jax.core.settings import require
 from rewire_jax.reports.provenance import origin
@@ -19,40 +18,44 @@ from rewire_jax.storage.run_results import RunData, read_run
 SCENARIO = "halfcheetah/forgetting"
 AVERAGED = {"critic_entropy": "batch_mean", "policy_states": "both"}
 SCALED = AVERAGED | {"reward_scale": 10.0}
-MANY = {"envs": 128, "interactions": 153_600, "warmup": 10_240, "report_every": 12_800}
 HALF = {"envs": 64, "interactions": 76_800, "warmup": 5_120, "report_every": 6_400}
+MANY = {"envs": 128, "interactions": 153_600, "warmup": 10_240, "report_every": 12_800}
+LONG = MANY | {"interactions": 307_200}
+DOUBLE = MANY | {"updates": 32}
 FEW = {"updates": 8, "interactions": 153_600, "warmup": 5_120, "report_every": 6_400}
-SMALL = {"batch_size": 128}
+WARM, SMALL = {"initial_temperature": 1.0}, {"batch_size": 128}
+QUICK, SLOW, PINK = {"discount": 0.97}, {"target_rate": 0.02}, {"noise_color": 1.0}
 REGIMES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "averaged": ({}, AVERAGED),
-    "averaged, scale 10": ({}, SCALED),
-    "64 environments": (HALF, AVERAGED),
-    "128 environments": (MANY, AVERAGED),
-    "width 64": (MANY, AVERAGED | {"hidden": 64}),
-    "temperature 1": (MANY, AVERAGED | {"initial_temperature": 1.0}),
-    "twice as long": (
-        MANY | {"interactions": 307_200},
-        AVERAGED | {"initial_temperature": 1.0},
-    ),
-    "policy's rate 3e-4": (MANY, AVERAGED | {"lr_policy": 3e-4}),
-    "scale 10": (MANY, SCALED),
-    "scale 10, temperature 1": (MANY, SCALED | {"initial_temperature": 1.0}),
-    "pink noise": (MANY, SCALED | {"noise_color": 1.0}),
-    "discount 0.97": (MANY, SCALED | {"discount": 0.97}),
-    "target rate 0.02": (MANY, SCALED | {"target_rate": 0.02}),
-    "all three": (
-        MANY,
-        SCALED | {"discount": 0.97, "target_rate": 0.02, "noise_color": 1.0},
-    ),
-    "policy at each update": (MANY, SCALED | {"policy_delay": 1}),
-    "batch 128, twice the updates": (MANY | {"updates": 32}, SCALED | SMALL),
-    "the same, 32 environments": (FEW, SCALED | SMALL),
-    "then scale 1": (FEW, AVERAGED | SMALL),
-    "then scale 3": (FEW, AVERAGED | SMALL | {"reward_scale": 3.0}),
+    "envs-32": ({}, AVERAGED),
+    "envs-32-scale-10": ({}, SCALED),
+    "envs-64": (HALF, AVERAGED),
+    "envs-128": (MANY, AVERAGED),
+    "envs-128-width-64": (MANY, AVERAGED | {"hidden": 64}),
+    "envs-128-temperature-1": (MANY, AVERAGED | WARM),
+    "envs-128-temperature-1-long": (LONG, AVERAGED | WARM),
+    "envs-128-policy-rate-3e-4": (MANY, AVERAGED | {"lr_policy": 3e-4}),
+    "envs-128-scale-10": (MANY, SCALED),
+    "envs-128-scale-10-temperature-1": (MANY, SCALED | WARM),
+    "envs-128-scale-10-pink": (MANY, SCALED | PINK),
+    "envs-128-scale-10-discount-0.97": (MANY, SCALED | QUICK),
+    "envs-128-scale-10-target-rate-0.02": (MANY, SCALED | SLOW),
+    "envs-128-scale-10-pink-discount-target-rate": (MANY, SCALED | QUICK | SLOW | PINK),
+    "envs-128-scale-10-policy-delay-1": (MANY, SCALED | {"policy_delay": 1}),
+    "envs-128-scale-10-batch-128": (DOUBLE, SCALED | SMALL),
+    "envs-32-scale-10-batch-128": (FEW, SCALED | SMALL),
+    "envs-32-batch-128": (FEW, AVERAGED | SMALL),
+    "envs-32-scale-3-batch-128": (FEW, AVERAGED | SMALL | {"reward_scale": 3.0}),
 }
 """Changes of the quick profile's settings, and of SAC's."""
-HEAD = ["regime", "environments", "interactions", "updates", "batch", "seeds"]
+HEAD = ["regime", "interactions", "updates", "seeds"]
 HEAD += ["training return, each seed", "without exploration, each seed"]
+READING = (
+    "All regimes have a reduced budget (paper: 1,000,000 interactions) and change the "
+    "quick profile. All use `--critic-entropy batch_mean --policy-states both`. In "
+    "their names, envs is `--envs`, scale `--reward-scale`, width `--hidden`, "
+    "temperature `--initial-temperature`, pink `--noise-color 1`, batch "
+    "`--batch-size`. The training return is the mean over the last whole episode."
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,84 +63,72 @@ class Regimes(suite.Experiment):
     """What to run.
 
     Attributes:
-      regimes: numbers of the regimes, from 0; all if empty.
+      regimes: names of the regimes; all if empty.
     """
 
-    regimes: tuple[int, ...] = ()
+    regimes: tuple[str, ...] = ()
     tasks: int = 1
 
-    def all(self) -> list[tuple[str, list[suite.Run]]]:
+    def all(self) -> dict[str, list[suite.Run]]:
         """The runs of each chosen regime, one for each seed."""
-        scenario = self.scenario_of(SCENARIO)
-        wrong = set(self.regimes) - set(range(len(REGIMES)))
-        require(not wrong, f"--regimes are 0 to {len(REGIMES) - 1}, not {wrong}")
-        made = []
-        for place, (name, (changes, sac)) in enumerate(REGIMES.items()):
-            if place not in (self.regimes or range(len(REGIMES))):
-                continue
-            runs = []
-            for seed in range(self.seed, self.seed + self.seeds):
-                folder = self.out / "quick-regime" / str(place) / f"seed-{seed}"
-                run = replace(self, seed=seed, seeds=1).run(
-                    scenario, "ft1", folder, sac
-                )
-                changed = replace(
-                    run.settings, eval_episodes=32, checkpoint_every=0, **changes
-                )
-                runs.append(run._replace(settings=changed))
-            made.append((name, runs))
-        return made
+        unknown = set(self.regimes) - set(REGIMES)
+        require(
+            not unknown,
+            f"--regimes {' '.join(unknown)}: choose from {', '.join(REGIMES)}",
+        )
+        seeds = range(self.seed, self.seed + self.seeds)
+        names = self.regimes or tuple(REGIMES)
+        return {name: [self.one(name, seed) for seed in seeds] for name in names}
+
+    def one(self, name: str, seed: int) -> suite.Run:
+        """The run of a regime with a seed."""
+        changes, sac = REGIMES[name]
+        folder = self.out / "quick-regime" / name / f"seed-{seed}"
+        single = replace(self, seed=seed, seeds=1)
+        run = single.run(self.scenario_of(SCENARIO), "ft1", folder, sac)
+        settings = replace(
+            run.settings, eval_episodes=32, checkpoint_every=0, **changes
+        )
+        return run._replace(settings=settings)
 
 
-def ending(run: RunData) -> float:
-    """The training return over the last tenth of the reports."""
-    values = run.curve[0][1][0]
-    return float(np.mean(values[-max(len(values) // 10, 1) :]))
-
-
-def row(name: str, runs: Sequence[RunData]) -> list[str]:
+def row(name: str, runs: Sequence[RunData], trained: Trained) -> list[str]:
     """A regime's cells."""
     settings: dict[str, Any] = runs[0].settings
     begun = settings["interactions"] - settings["warmup"]
     updates = begun // settings["envs"] * settings["updates"]
     return [
         name,
-        str(settings["envs"]),
         f"{settings['interactions']:,}",
         f"{updates:,}",
-        str(settings["sac"]["batch_size"]),
-        ", ".join(str(seed) for run in runs for seed in run.seeds),
-        ", ".join(number(ending(run)) for run in runs),
-        ", ".join(number(float(run.scores[0, 0, 0])) for run in runs),
+        ", ".join(map(str, trained.seeds)),
+        ", ".join(map(number, trained.end)),
+        ", ".join(map(number, trained.returns)),
     ]
 
 
 def run(job: Regimes) -> None:
     """Trains what is unfinished, and writes the table; raises as `suite.train`."""
     regimes = job.all()
-    suite.train([run for _, runs in regimes for run in runs], job)
+    suite.train([run for runs in regimes.values() for run in runs], job)
     rows, numbers, origins = [HEAD], [], []
-    for name, runs in regimes:
+    for name, runs in regimes.items():
         done = [read_run(run.folder) for run in runs if run.finished]
         if not done:
             continue
-        rows.append(row(name, done))
+        trained = first_task.gather(name, done)
+        rows.append(row(name, done, trained))
         origins.append(origin(name, *done))
+        ends = zip(trained.seeds, trained.end, trained.returns, strict=True)
         numbers += [
-            {
-                "regime": name,
-                "seed": data.seeds[0],
-                "training": ending(data),
-                "deterministic": float(data.scores[0, 0, 0]),
-            }
-            for data in done
+            {"regime": name, "seed": seed, "training": end, "deterministic": after}
+            for seed, end, after in ends
         ]
     require(bool(numbers), "none of the runs has ended")
-    backend = regimes[0][1][0].settings.backend
+    backend = job.scenario_of(SCENARIO).backend
     title = f"Short regimes: FT-1 on the first task of {SCENARIO}, {backend} backend"
-    notes = ["", "All are reduced budgets (paper: 1,000,000 interactions).", ""]
     path = job.folder("quick-regime") / "quick-regime"
-    suite.write(path, title, rows, [*notes, *origins], numbers)
+    suite.write(path, title, rows, ["", READING, "", *origins], numbers)
 
 
 if __name__ == "__main__":

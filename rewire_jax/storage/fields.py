@@ -39,7 +39,7 @@ SETTINGS = {
     **dict.fromkeys(("scenario", "method", "profile", "backend"), Field(str)),
     "interactions": Field(int, 1),
     "seed": _COUNT,
-    "seeds": Field(int, 1, 4096),
+    "seeds": Field(int, 1),
 }
 """Of a header's settings: what reports need."""
 

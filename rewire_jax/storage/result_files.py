@@ -1,6 +1,6 @@
 """What the result files of a run and of a sweep share, and how they are read."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = dict[tuple[int, ...], dict[str, float]]
 """Values of evaluations by member, stage and task; -1 is the stage before training."""
+SeedOf = Callable[[int], int | None]
+"""From the number of a member to its seed; None if there is no such member."""
 
 _FACTS = {
     "diverged": "diverged",
@@ -106,10 +108,10 @@ def check_tables(folder: Path) -> None:
         return
 
 
-def check_member(row: Mapping[str, Any], seeds: Mapping[int, int]) -> int:
-    """The member of a row, by the seed of each; `ValueError` if there is none."""
+def check_member(row: Mapping[str, Any], seed_of: SeedOf) -> int:
+    """The member of a row; `ValueError` if there is none with the row's seed."""
     member, seed = row["member"], row["seed"]
-    if seeds.get(member) != seed:
+    if seed_of(member) != seed:
         raise ValueError(f"there is no member {member} with seed {seed}")
     return member
 
@@ -117,7 +119,7 @@ def check_member(row: Mapping[str, Any], seeds: Mapping[int, int]) -> int:
 def read_evaluations(
     path: Path,
     names: Sequence[str],
-    seeds: Mapping[int, int],
+    seed_of: SeedOf,
     stages: range,
     *,
     also: tuple[str, ...] = (),
@@ -128,7 +130,7 @@ def read_evaluations(
     Args:
         path: the file.
         names: of the sequence's tasks.
-        seeds: of the members, by number.
+        seed_of: seeds of the members that it may hold.
         stages: that it may hold.
         also: values that rows must have besides a run's.
         needed: otherwise a missing file has no rows.
@@ -145,7 +147,7 @@ def read_evaluations(
         rates = [each.name for each in SUCCESS.values() if each.name in row]
         values = {name: number(row[name]) for name in ("return", *rates, *also)}
         values |= {name: float(row[field]) for name, field in _FACTS.items()}
-        return (check_member(row, seeds), row["stage"], row["task"]), values
+        return (check_member(row, seed_of), row["stage"], row["task"]), values
 
     return table(path, parse, needed=needed)
 

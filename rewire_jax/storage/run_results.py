@@ -14,6 +14,7 @@ from rewire_jax.storage.result_files import (
     Array,
     Flags,
     Results,
+    SeedOf,
     check_member,
     check_tables,
     read_evaluations,
@@ -95,12 +96,13 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     head = read_header(Path(folder), "run")
     folder, tasks = head.folder, len(head.tasks)
     check_tables(folder)
-    path, members = folder / "results.jsonl", _members(head)
-    rows = read_evaluations(path, head.tasks, members, range(-1, tasks))
+    path, seed_of = folder / "results.jsonl", _seed_of(head)
+    rows = read_evaluations(path, head.tasks, seed_of, range(-1, tasks))
     if not rows:
         raise UserError(f"{path} holds no results yet")
     found = sorted({member for member, _, _ in rows})
-    seeds = [members[member] for member in found]
+    first = head.settings["seed"]
+    seeds = [first + member for member in found]
     values = to_arrays(rows, found, tasks)
     measured = {s: values[s.name] for s in SCORES if s.name in values}
     score = SUCCESS[success] if SUCCESS[success] in measured else RETURN
@@ -140,10 +142,10 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
     return _curve(run, run.seeds, run.finished > 0, name)
 
 
-def _members(head: Results) -> dict[int, int]:
-    """The seed of each member."""
+def _seed_of(head: Results) -> SeedOf:
+    """The seeds of a run's members, which are consecutive."""
     first, count = (head.settings[name] for name in ("seed", "seeds"))
-    return dict(enumerate(range(first, first + count)))
+    return lambda member: first + member if member < count else None
 
 
 def _curve(
@@ -151,12 +153,12 @@ def _curve(
 ) -> tuple[tuple[Array, Array], ...]:
     """A value of the progress reports per stage, see `RunData.curve`."""
     place = {seed: i for i, seed in enumerate(seeds)}
-    members, stages = _members(head), range(len(head.tasks))
+    seed_of, stages = _seed_of(head), range(len(head.tasks))
     known = fields.training(stages)
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
         row = fields.checked(row, known, fields.OTHERS)
-        check_member(row, members)
+        check_member(row, seed_of)
         key = row["stage"], row["interactions"], place[row["seed"]]
         return key, number(row[name])
 

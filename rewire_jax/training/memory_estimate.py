@@ -27,13 +27,14 @@ from rewire_jax.methods import find_method
 from rewire_jax.methods.base import map_own
 from rewire_jax.training import colored_noise, rollout, train_loop
 from rewire_jax.training.run_setup import Plan
-from rewire_jax.training.time_estimate import least_years
+from rewire_jax.training.time_estimate import least_hours
 
 # Share of a device's memory; the rest is for compiled code and other programs.
 _SHARE = 0.8
 # With more members, a CPU's caches are too small and each member takes longer.
 _SIDE_BY_SIDE = 8
 _LISTED = 10_000  # bytes on the host for a member's settings, name and place
+_YEAR = 365.25 * 24  # hours
 _YEARS = 10
 
 
@@ -82,7 +83,7 @@ def check(plan: Plan) -> None:
     require(
         room is None or held <= room,
         f"a run of this size needs {held / 1e9:.3g} GB and at least "
-        f"{least_years(plan, len(plan.members)):.2g} years, but the memory has "
+        f"{least_hours(plan, len(plan.members)):.2g} hours, but the memory has "
         f"{(room or 0) / 1e9:.3g} GB: lower --seeds, --buffer, --envs or --hidden",
     )
 
@@ -98,7 +99,7 @@ def check_sweep(plan: Plan, members: int, folder: Path) -> None:
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     kept = size((learner.params, learner.method_state, learner.critic))
     kept *= plan.settings.tasks * members // plan.num_slots
-    listed, years = members * _LISTED, least_years(plan, members)
+    listed, years = members * _LISTED, least_hours(plan, members) / _YEAR
     there = next(x for x in (folder, *folder.absolute().parents) if x.exists())
     disk, memory = shutil.disk_usage(there).total, machine_bytes()
     require(

@@ -9,11 +9,10 @@ from rewire_jax.training.run_setup import Plan
 
 _CORE, _ACCELERATOR = 1e11, 1e15  # multiplications a second that none exceeds
 _PASSES = 3  # through a network in an update: forward, and backward twice as long
-_YEAR = 365.25 * 24 * 3600
 
 
-def least_years(plan: Plan, members: int) -> float:
-    """Years for the updates of so many members; steps of environments come on top.
+def least_hours(plan: Plan, members: int) -> float:
+    """Hours for the updates of so many members; steps of environments come on top.
 
     Args:
       plan: plan of any of them.
@@ -28,4 +27,4 @@ def least_years(plan: Plan, members: int) -> float:
     devices = jax.local_devices()
     on_cpu = devices[0].platform == "cpu"
     cores = _CORE * (os.cpu_count() or 1)
-    return work / (cores if on_cpu else _ACCELERATOR * len(devices)) / _YEAR
+    return work / (cores if on_cpu else _ACCELERATOR * len(devices)) / 3600

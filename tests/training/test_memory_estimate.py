@@ -14,7 +14,7 @@ from rewire_jax.methods import METHODS
 from rewire_jax.training import memory_estimate
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import Plan, prepare
-from rewire_jax.training.time_estimate import least_years
+from rewire_jax.training.time_estimate import least_hours
 from tests.tiny import tiny
 
 FOUR = 4  # bytes of a number
@@ -214,12 +214,12 @@ def test_a_sweep_that_no_machine_can_train_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_years_are_those_of_the_updates() -> None:
+def test_hours_are_those_of_the_updates() -> None:
     one, other = (prepare(settings(updates=n)) for n in (4, 8))
-    years = least_years(one, 1)
-    assert 0 < years < 1e-6
-    assert least_years(one, 7) == pytest.approx(7 * years)
-    assert least_years(other, 1) == pytest.approx(2 * years)
+    hours = least_hours(one, 1)
+    assert 0 < hours < 1e-6 * 365.25 * 24
+    assert least_hours(one, 7) == pytest.approx(7 * hours)
+    assert least_hours(other, 1) == pytest.approx(2 * hours)
 
 
 def test_episodes_are_played_in_parts_that_fit(monkeypatch: pytest.MonkeyPatch) -> None:
