@@ -194,7 +194,8 @@ _AT_LEAST: dict[str, float] = {
 # Counters and floats have 32 bits. The other limits only prevent endless loops.
 _LARGEST = 2**31
 _LARGEST_FLOAT, _SMALLEST_FLOAT = 3.4e38, 1.2e-38
-_AT_MOST = {"seeds": 4_096, "depth": 1_000}
+MOST_SEEDS = 4_096
+_AT_MOST = {"seeds": MOST_SEEDS, "depth": 1_000}
 _POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
 _SHARE = ("discount", "target_rate")
 _KINDS: dict[Any, tuple[type, str]] = {

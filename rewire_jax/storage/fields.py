@@ -4,6 +4,8 @@ import sys
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
+from rewire_jax.core.settings import MOST_SEEDS
+
 _LARGEST = sys.float_info.max  # so that neither NaN nor infinity is in any range
 _NOUNS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
@@ -39,7 +41,7 @@ SETTINGS = {
     **dict.fromkeys(("scenario", "method", "profile", "backend"), Field(str)),
     "interactions": Field(int, 1),
     "seed": _COUNT,
-    "seeds": Field(int, 1),
+    "seeds": Field(int, 1, MOST_SEEDS),
 }
 """Of a header's settings: what reports need."""
 

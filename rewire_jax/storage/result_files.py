@@ -1,6 +1,6 @@
 """What the result files of a run and of a sweep share, and how they are read."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +17,6 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Rows = dict[tuple[int, ...], dict[str, float]]
 """Values of evaluations by member, stage and task; -1 is the stage before training."""
-SeedOf = Callable[[int], int | None]
-"""From the number of a member to its seed; None if there is no such member."""
 
 _FACTS = {
     "diverged": "diverged",
@@ -108,10 +106,10 @@ def check_tables(folder: Path) -> None:
         return
 
 
-def check_member(row: Mapping[str, Any], seed_of: SeedOf) -> int:
-    """The member of a row; `ValueError` if there is none with the row's seed."""
+def check_member(row: Mapping[str, Any], seeds: Mapping[int, int]) -> int:
+    """The member of a row, by the seed of each; `ValueError` if there is none."""
     member, seed = row["member"], row["seed"]
-    if seed_of(member) != seed:
+    if seeds.get(member) != seed:
         raise ValueError(f"there is no member {member} with seed {seed}")
     return member
 
@@ -119,7 +117,7 @@ def check_member(row: Mapping[str, Any], seed_of: SeedOf) -> int:
 def read_evaluations(
     path: Path,
     names: Sequence[str],
-    seed_of: SeedOf,
+    seeds: Mapping[int, int],
     stages: range,
     *,
     also: tuple[str, ...] = (),
@@ -130,7 +128,7 @@ def read_evaluations(
     Args:
         path: the file.
         names: of the sequence's tasks.
-        seed_of: seeds of the members that it may hold.
+        seeds: of the members, by number.
         stages: that it may hold.
         also: values that rows must have besides a run's.
         needed: otherwise a missing file has no rows.
@@ -147,7 +145,7 @@ def read_evaluations(
         rates = [each.name for each in SUCCESS.values() if each.name in row]
         values = {name: number(row[name]) for name in ("return", *rates, *also)}
         values |= {name: float(row[field]) for name, field in _FACTS.items()}
-        return (check_member(row, seed_of), row["stage"], row["task"]), values
+        return (check_member(row, seeds), row["stage"], row["task"]), values
 
     return table(path, parse, needed=needed)
 

@@ -14,7 +14,6 @@ from rewire_jax.storage.result_files import (
     Array,
     Flags,
     Results,
-    SeedOf,
     check_member,
     check_tables,
     read_evaluations,
@@ -96,13 +95,12 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     head = read_header(Path(folder), "run")
     folder, tasks = head.folder, len(head.tasks)
     check_tables(folder)
-    path, seed_of = folder / "results.jsonl", _seed_of(head)
-    rows = read_evaluations(path, head.tasks, seed_of, range(-1, tasks))
+    path, members = folder / "results.jsonl", _members(head)
+    rows = read_evaluations(path, head.tasks, members, range(-1, tasks))
     if not rows:
         raise UserError(f"{path} holds no results yet")
     found = sorted({member for member, _, _ in rows})
-    first = head.settings["seed"]
-    seeds = [first + member for member in found]
+    seeds = [members[member] for member in found]
     values = to_arrays(rows, found, tasks)
     measured = {s: values[s.name] for s in SCORES if s.name in values}
     score = SUCCESS[success] if SUCCESS[success] in measured else RETURN
@@ -142,10 +140,10 @@ def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:
     return _curve(run, run.seeds, run.finished > 0, name)
 
 
-def _seed_of(head: Results) -> SeedOf:
-    """The seeds of a run's members, which are consecutive."""
+def _members(head: Results) -> dict[int, int]:
+    """The seed of each member."""
     first, count = (head.settings[name] for name in ("seed", "seeds"))
-    return lambda member: first + member if member < count else None
+    return dict(enumerate(range(first, first + count)))
 
 
 def _curve(
@@ -153,12 +151,12 @@ def _curve(
 ) -> tuple[tuple[Array, Array], ...]:
     """A value of the progress reports per stage, see `RunData.curve`."""
     place = {seed: i for i, seed in enumerate(seeds)}
-    seed_of, stages = _seed_of(head), range(len(head.tasks))
+    members, stages = _members(head), range(len(head.tasks))
     known = fields.training(stages)
 
     def parse(row: dict[str, Any]) -> tuple[tuple[int, ...], float]:
         row = fields.checked(row, known, fields.OTHERS)
-        check_member(row, seed_of)
+        check_member(row, members)
         key = row["stage"], row["interactions"], place[row["seed"]]
         return key, number(row[name])
 

@@ -114,7 +114,7 @@ def read_sweep(folder: str | Path) -> SweepData:
         rows |= read_evaluations(
             place / "results.jsonl",
             head.tasks,
-            {member: int(design["seeds"][member]) for member in members}.get,
+            {member: int(design["seeds"][member]) for member in members},
             stages if now else range(-1, 1),  # before any training, too
             also=("choice",),
             needed=False,

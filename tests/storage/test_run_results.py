@@ -46,11 +46,6 @@ def test_damaged_settings(tmp_path: Path) -> None:
         read_run(path.parent)
 
 
-def test_a_run_may_have_many_seeds(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path / "run", seed=7, seeds=5_000, stages=1))
-    assert run.seeds == tuple(range(7, 5_007))
-
-
 def test_half_written_stage_does_not_count(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run")
     path = run / "results.jsonl"
