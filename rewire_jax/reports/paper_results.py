@@ -45,7 +45,7 @@ class Source(NamedTuple):
     name: str
     results: dict[str, Figures]
     unit: str = "÷ SAC-N"
-    made: str = "over SAC-N's on Brax v1: the physics here is another"
+    made: str = "over SAC-N's on Brax v1"
 
     @property
     def key(self) -> str:
@@ -169,8 +169,17 @@ _SCENARIOS = {
 }
 
 
-def sources(scenario: str) -> tuple[Source, ...]:
-    """What the paper has on a scenario of its own, and on its domain."""
+def sources(scenario: str, backend: str = "v1") -> tuple[Source, ...]:
+    """What the paper has on a scenario of its own, and on its domain.
+
+    On Brax, results of another backend than the paper's are told apart in `made`.
+    """
     domain, _, kind = scenario.partition("/")
     whole = _DOMAINS.get(domain) if kind in _KINDS else None
-    return tuple(source for source in (whole, _SCENARIOS.get(scenario)) if source)
+    found = tuple(source for source in (whole, _SCENARIOS.get(scenario)) if source)
+    if domain not in _DOMAINS or backend == "v1":
+        return found
+    return tuple(
+        source._replace(made=f"{source.made}: the physics here is another")
+        for source in found
+    )

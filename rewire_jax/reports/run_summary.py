@@ -134,7 +134,9 @@ def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Compar
             )
     areas = _alone(single, first)
     base, raw = _reference(runs) if first.score.normalised else (None, None)
-    sources = paper_results.sources(first.settings["scenario"])
+    sources = paper_results.sources(
+        first.settings["scenario"], first.settings["backend"]
+    )
     methods = Counter(run.settings["method"] for run in runs)
     summaries = []
     for run, label in zip(runs, _labels(runs), strict=True):

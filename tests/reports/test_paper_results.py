@@ -23,6 +23,15 @@ def test_every_sequence_of_the_paper_has_every_method() -> None:
             assert table.results["sac_n"].mean == table.results["ft1"].size == 1
 
 
+def test_only_v1_has_the_physics_of_the_paper() -> None:
+    ours, other = (
+        {source.made for source in paper_results.sources("halfcheetah/forgetting", on)}
+        for on in ("v1", "positional")
+    )
+    assert all("another" in made for made in other)
+    assert not any("another" in made for made in ours)
+
+
 def test_scenarios_of_ones_own_have_none() -> None:
     for name in ("ant/limping", "probe/reach", "continual_world/hammer"):
         assert paper_results.sources(name) == ()
