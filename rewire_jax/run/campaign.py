@@ -15,7 +15,7 @@ from typing import NamedTuple
 from rewire_jax.core.settings import require
 from rewire_jax.run.campaign_file import Campaign, read_campaign
 from rewire_jax.run.campaign_jobs import Job, Process, jobs_of
-from rewire_jax.run.campaign_population import arrange
+from rewire_jax.run.campaign_population import decide
 from rewire_jax.run.campaign_status import hours_left
 from rewire_jax.run.interrupts import Stopped
 
@@ -201,8 +201,8 @@ def campaign(
 ) -> Path:
     """Trains what is missing of a campaign, in processes side by side.
 
-    `run_campaign` modules describe the file and the folder. Several calls, also on
-    several machines that share a file system, share the runs.
+    `campaign_file` describes the file, and `campaign_jobs` the folder. Several calls,
+    also on several machines that share a file system, share the runs.
 
     Args:
       file: TOML file of the campaign.
@@ -222,17 +222,17 @@ def campaign(
     require(workers >= 0, f"--workers must be at least 0, not {workers}")
     made = read_campaign(file)
     root = Path(out or default_folder(made))
-    workers = workers or default_workers()
-    jobs, workers = arrange(made, root, slots(workers))
+    processes = workers or default_workers()
+    runs = decide(made, root, slots(processes))
+    if not workers and any(len(run.seeds) > 1 for run in runs):
+        processes = 1  # A population uses all cores.
+    jobs = jobs_of(root, runs)
     if retry:
         for job in jobs:
             job.forgive()
-    crew = Crew(jobs, slots(workers), limit)
+    crew = Crew(jobs, slots(processes), limit)
     with _heard(crew):
         crew.work()
     if crew.stops:
         raise Stopped(f"stopped and saved in {root}: repeat the command to continue")
     return root
-
-
-__all__ = ["campaign", "default_folder", "jobs_of"]

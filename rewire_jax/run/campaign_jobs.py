@@ -21,7 +21,7 @@ import jax
 
 from rewire_jax.core.errors import writing
 from rewire_jax.run import run_state
-from rewire_jax.run.campaign_file import Campaign, Run
+from rewire_jax.run.campaign_file import Run
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading, text
 
@@ -130,13 +130,13 @@ class Job:
         return start(words, self.notes / "log.txt", cores)
 
 
-def jobs_of(campaign: Campaign, root: Path, runs: Sequence[Run] = ()) -> list[Job]:
-    """The jobs of a campaign, by default one for each configuration and seed.
+def jobs_of(root: Path, runs: Sequence[Run]) -> list[Job]:
+    """The jobs of runs in a campaign's folder.
 
     Raises:
       UserError: a folder holds a run with other settings.
     """
-    jobs = [Job(root, run) for run in runs or campaign.runs]
+    jobs = [Job(root, run) for run in runs]
     for job in jobs:
         if job.started:
             run_folder.compare(job.folder, job.run.settings)
@@ -182,5 +182,3 @@ def last_line(path: Path) -> str:
     """The last line of a file that is not empty."""
     lines = text(path).split("\n") if path.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "")
-
-
