@@ -6,6 +6,7 @@ in the campaign's folder keeps the figures.
 
 import shutil
 import sys
+import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from rewire_jax.storage.json_lines import document, reading
 from rewire_jax.storage.result_files import read_timing
 
 _CHUNKS = 5  # of which the first compiles
+_POLL = 1.0  # seconds, to wait for another process
 NAME = "population.json"
 
 
@@ -50,12 +52,14 @@ def decide(
       slots: the cores of each process that would train side by side.
 
     Raises:
-      UserError: as `grouped`; or another process measures.
+      UserError: as `grouped`.
     """
     path, asked = root / NAME, campaign.population
-    with run_folder.claimed(root) as ours:
-        if not path.exists():
-            require(ours, f"another process measures in {root}: try again in minutes")
+    while not path.exists():
+        with run_folder.claimed(root) as ours:
+            if not ours:  # Another process measures.
+                time.sleep(_POLL)
+                continue
             note: dict[str, Any] = {"population": asked == "always"}
             several = [r for r in as_populations(campaign.runs) if len(r.seeds) > 1]
             if asked == "auto" and several:

@@ -37,7 +37,7 @@ class Status:
         lines += [f"running: {name}" for name in self.running]
         lines += [f"failed: {name}: {reason}" for name, reason in self.failed.items()]
         lines += [f"missing: {name}" for name in self.missing]
-        if self.hours is None:
+        if not self.hours:
             return "\n".join(lines)
         left = timedelta(hours=math.ceil(self.hours * 3600) / 3600)
         lines.append(f"the rest takes about {left} of training, run after run")
