@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rewire_jax.core.settings import require
-from rewire_jax.run.campaign_file import Campaign, read_campaign
-from rewire_jax.run.campaign_jobs import Job, Process, jobs_of
+from rewire_jax.run.campaign_file import read_campaign
+from rewire_jax.run.campaign_jobs import Job, Process, default_folder, jobs_of
 from rewire_jax.run.campaign_population import decide
 from rewire_jax.run.campaign_status import hours_left
 from rewire_jax.run.interrupts import Stopped
@@ -184,11 +184,6 @@ def default_workers() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def default_folder(campaign: Campaign) -> Path:
-    """Folder of a campaign if none is given."""
-    return Path("runs") / campaign.path.stem
 
 
 def campaign(

@@ -21,7 +21,7 @@ import jax
 
 from rewire_jax.core.errors import writing
 from rewire_jax.run import run_state
-from rewire_jax.run.campaign_file import Run
+from rewire_jax.run.campaign_file import Campaign, Run
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading, text
 
@@ -128,6 +128,11 @@ class Job:
         resume = ["--resume"] if self.started else []
         words = [*self.run.words(), "--out", str(self.folder), *resume]
         return start(words, self.notes / "log.txt", cores)
+
+
+def default_folder(campaign: Campaign) -> Path:
+    """Folder of a campaign if none is given."""
+    return Path("runs") / campaign.path.stem
 
 
 def jobs_of(root: Path, runs: Sequence[Run]) -> list[Job]:

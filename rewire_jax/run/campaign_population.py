@@ -68,6 +68,20 @@ def decide(
     return grouped(campaign, root)
 
 
+def submitted_runs(campaign: Campaign, root: Path) -> list[Run]:
+    """The runs to submit to a cluster: of single seeds, if nobody has said so.
+
+    A machine that submits may differ from those that train, so nothing is measured.
+
+    Raises:
+      UserError: as `grouped`.
+    """
+    if not (root / NAME).exists():
+        run_folder.make(root)
+        run_folder.write(root / NAME, {"population": campaign.population == "always"})
+    return grouped(campaign, root)
+
+
 def measure(run: Run, root: Path, slots: Sequence[Collection[int]]) -> dict[str, Any]:
     """Measures a run as a population, and its seeds side by side.
 

@@ -5,9 +5,12 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import timedelta
+from pathlib import Path
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.run.campaign_jobs import Job
+from rewire_jax.run.campaign_file import read_campaign
+from rewire_jax.run.campaign_jobs import Job, default_folder, jobs_of
+from rewire_jax.run.campaign_population import grouped
 from rewire_jax.storage.result_files import read_timing
 
 
@@ -44,8 +47,23 @@ class Status:
         return "\n".join(lines)
 
 
+def campaign_status(file: str | Path, out: str | Path | None = None) -> Status:
+    """The status of a campaign, from its file and its folder.
+
+    Args:
+      file: TOML file of the campaign.
+      out: folder of the campaign; by default `runs/` and the name of the file.
+
+    Raises:
+      UserError: something in the file is wrong, or a folder holds another run.
+    """
+    made = read_campaign(file)
+    root = Path(out or default_folder(made))
+    return status(jobs_of(root, grouped(made, root)))
+
+
 def status(jobs: Sequence[Job]) -> Status:
-    """The status of a campaign, from its folder."""
+    """The status of the jobs of a campaign."""
     found: dict[str, list[Job]] = defaultdict(list)
     failed = {}
     for job in jobs:
