@@ -11,7 +11,8 @@ from typing import Annotated, get_args
 
 import tyro
 
-from rewire_jax.core.formatting import seconds
+from rewire_jax.cli.campaign_command import Campaign
+from rewire_jax.cli.flags import Flags
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.envs.scenarios import Scenario, list_scenarios, make_scenario
 from rewire_jax.methods import METHODS
@@ -19,9 +20,6 @@ from rewire_jax.rendering import render
 from rewire_jax.reports.report import to_terminal
 from rewire_jax.reports.write import write_report
 from rewire_jax.run import evaluation, sweep, train_run
-from rewire_jax.run.campaign import campaign
-from rewire_jax.run.campaign_status import campaign_status
-from rewire_jax.run.campaign_submit import Cluster, submit
 from rewire_jax.storage.scores import Success
 
 Axes = Annotated[
@@ -29,22 +27,6 @@ Axes = Annotated[
     tyro.conf.UseAppendAction,
     tyro.conf.arg(metavar="NAME VALUE..."),
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Flags:
-    """Flags of every command.
-
-    Attributes:
-      cache: folder for compiled programs; "off" keeps none. By default the folder in
-        JAX_COMPILATION_CACHE_DIR if it is set, else ~/.cache/rewire_jax.
-      debug: print the traceback of an error.
-      version: print the version and exit.
-    """
-
-    cache: str | None = None
-    debug: tyro.conf.FlagCreatePairsOff[bool] = False
-    version: tyro.conf.FlagCreatePairsOff[bool] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,48 +120,6 @@ class Sweep(Flags):
             print(f"finished: `rewire-jax report {folder}` shows the sweep")
         else:
             print(to_terminal(write_report([folder], folder)), end="")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Campaign(Flags):
-    """Trains what is missing of a campaign: many runs, listed in a TOML file.
-
-    The runs are trained side by side, in order of priority. A stopped campaign goes on
-    with the same command. A run that fails twice is set aside, and the others go on.
-
-    Attributes:
-      file: TOML file of the campaign.
-      out: folder of the campaign; by default runs/ and the name of the file.
-      limit: time after which to save and stop, for example 150m or 2h30m; on a cluster,
-        the time limit of a job.
-      workers: number of runs trained at the same time; 0 for one for each core, or for
-        one if there is an accelerator.
-      status: train nothing; print what is finished, running, failed and missing.
-      retry: also train runs that were set aside.
-      submit: train each run in a job of submitit: on "slurm", or "local" on this machine.
-    """
-
-    file: tyro.conf.Positional[Path]
-    out: Path | None = None
-    limit: Annotated[str | None, tyro.conf.arg(name="for")] = None
-    workers: int = 0
-    status: tyro.conf.FlagCreatePairsOff[bool] = False
-    retry: tyro.conf.FlagCreatePairsOff[bool] = False
-    submit: Cluster | None = None
-
-    def __call__(self) -> None:
-        """Trains or submits, then prints the campaign's status."""
-        shared = {
-            "limit": None if self.limit is None else seconds(self.limit),
-            "workers": self.workers,
-            "retry": self.retry,
-        }
-        if self.submit is not None and not self.status:
-            names = submit(self.file, self.out, cluster=self.submit, **shared)
-            print(f"submitted {len(names)} jobs: {' '.join(names)}".rstrip(": "))
-        elif not self.status:
-            campaign(self.file, self.out, **shared)
-        print(campaign_status(self.file, self.out))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -140,7 +140,9 @@ def _rate(
         for process in processes:
             process.kill()
     require(not any(ended), f"{' '.join(words)} failed")
-    timings = [read_timing(out / "timing.jsonl", 1, seeds, needed=True) for out in outs]
+    timings = [
+        read_timing(out / "timing.jsonl", range(1), seeds, needed=True) for out in outs
+    ]
     rates = [timing.rate for timing in timings if timing.rate is not None]
     require(len(rates) == len(outs), "it is too short to be measured")
     return sum(rates)

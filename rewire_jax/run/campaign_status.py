@@ -123,6 +123,8 @@ def _hours(job: Job) -> float:
     settings = job.run.settings
     path = job.folder / "timing.jsonl"
     try:
-        return read_timing(path, settings.tasks, settings.seeds, needed=False).hours
+        return read_timing(
+            path, range(settings.tasks), settings.seeds, needed=False
+        ).hours
     except UserError:
         return 0.0
