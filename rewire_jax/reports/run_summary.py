@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.reports import metrics, paper_results
+from rewire_jax.reports import metrics, paper_results, statistics
 from rewire_jax.reports.paper_results import Figures, Source
 from rewire_jax.reports.spread import Interval, Spread, spread
+from rewire_jax.reports.statistics import estimate
 from rewire_jax.storage.run_results import RunData
 from rewire_jax.storage.scores import Score
 
@@ -52,7 +53,7 @@ class Summary:
         performance: score after the last finished stage, averaged over the tasks
             trained by then.
         iqm: interquartile mean of these scores over seeds and tasks, with its
-            stratified bootstrap interval.
+            stratified bootstrap interval; SAC-N's seeds are drawn anew in it, too.
         forgetting: averaged over those tasks.
         transfer: forward transfer averaged over those tasks, where SAC-N normalises or
             single-task runs are given.
@@ -222,13 +223,14 @@ def _summary(
     theirs: tuple[Figures | None, ...],
 ) -> Summary:
     performance = forgetting = transfer = np.zeros(0)
-    ends = np.zeros((0, 0))
+    iqm = Interval(None, None, None)
     own: dict[str, Array] = {}
     if areas:
         alone = [areas[name] for name in run.tasks[: run.finished]]
         own["transfer"] = metrics.area_transfer(_areas(run, run.finished), alone)
     if run.finished:
         matrix = _matrix(run, run.finished)
+        iqm = _iqm(run, base)
         if base:
             # SAC-N as it was after as many tasks, the mean over its seeds.
             other = _matrix(base, run.finished).mean(axis=0)
@@ -240,7 +242,6 @@ def _summary(
             transfer = own["transfer"].mean(axis=-1)
         performance = metrics.performance(matrix)
         forgetting = metrics.forgetting(matrix).mean(axis=-1)
-        ends = metrics.final(matrix)
     others = [each for each in run.measured if each != run.score]
     return Summary(
         label=label,
@@ -248,7 +249,7 @@ def _summary(
         tasks=_tasks(run, run.score, own),
         others={score.name: _tasks(run, score, {}) for score in others},
         performance=spread(performance),
-        iqm=_iqm(ends),
+        iqm=iqm,
         forgetting=spread(forgetting),
         transfer=spread(transfer),
         published=theirs,
@@ -275,13 +276,24 @@ def _tasks(run: RunData, score: Score, own: dict[str, Array]) -> Tasks:
     )
 
 
-def _iqm(scores: Array) -> Interval:
-    """Interquartile mean of `[seeds, tasks]`; a seed with NaN is passed over."""
-    there = scores[~np.isnan(scores).any(axis=1)]
-    if not there.size:
-        return Interval(None, None, None)
-    value = float(metrics.interquartile_mean(there.ravel()))
-    return Interval(value, *(metrics.stratified_bootstrap(there) or (None, None)))
+def final_scores(run: RunData, done: int) -> Array:
+    """Scores of the first tasks after as many stages, `[seeds, done]`.
+
+    Diverged seeds and those with NaN are left out.
+    """
+    scores = metrics.final(_matrix(run, done))
+    return scores[~np.isnan(scores).any(axis=1)]
+
+
+def _iqm(run: RunData, base: RunData | None) -> Interval:
+    """Interquartile mean of what was reached; drawn anew with it is what divides it."""
+    scores = final_scores(run, run.finished)
+    if base is None:
+        return estimate(statistics.interquartile_mean, scores)
+    if base is run:  # One draw of SAC-N is both.
+        return estimate(lambda each: statistics.normalised_iqm(each, each), scores)
+    divisor = final_scores(base, run.finished)
+    return estimate(statistics.normalised_iqm, scores, divisor)
 
 
 def _labels(runs: Sequence[RunData]) -> list[str]:

@@ -1,18 +1,56 @@
-"""Statistics of Agarwal et al. (NeurIPS 2021) on plain arrays `[seeds, tasks]`.
+"""Statistics over seeds and tasks, on plain arrays `[..., seeds, tasks]`.
 
-They are those of the package rliable: a test compares them with its numbers. The
-interquartile mean is in `metrics`. Intervals are percentiles of a stratified bootstrap:
-for each task, seeds are drawn anew, with replacement.
+They are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of the
+Statistical Precipice" (NeurIPS 2021), and of its package rliable: a test compares them
+with rliable's numbers. Leading axes hold resamples.
 """
 
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from rewire_jax.reports.metrics import interquartile_mean
+from rewire_jax.reports.spread import Interval
 
 Array = NDArray[np.float64]
+
+
+def interquartile_mean(scores: ArrayLike) -> Array:
+    """Mean of the middle half: a quarter, rounded down, is cut from either end.
+
+    Args:
+        scores: `[..., seeds, tasks]`.
+
+    Returns:
+        `[...]`, NaN where a score is.
+    """
+    return np.asarray(scipy.stats.trim_mean(_flat(scores), 0.25, axis=-1))
+
+
+def normalised_iqm(scores: ArrayLike, reference: ArrayLike) -> Array:
+    """Interquartile mean of scores, divided by the mean of the reference's.
+
+    Args:
+        scores: `[..., seeds, tasks]`.
+        reference: `[..., seeds, tasks]`, SAC-N's on Brax.
+
+    Returns:
+        `[...]`.
+    """
+    return interquartile_mean(scores) / mean(reference)
+
+
+def mean(scores: ArrayLike) -> Array:
+    """Mean over seeds and tasks.
+
+    Args:
+        scores: `[..., seeds, tasks]`.
+
+    Returns:
+        `[...]`.
+    """
+    return np.asarray(_flat(scores).mean(axis=-1))
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
@@ -25,12 +63,8 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> Array:
     Returns:
         `[..., n]`.
     """
-    scores = np.asarray(scores, np.float64)
-    flat = np.sort(scores.reshape(*scores.shape[:-2], -1), axis=-1)
-    shares = [
-        np.mean(flat > threshold, axis=-1)
-        for threshold in np.asarray(thresholds, np.float64)
-    ]
+    flat = _flat(scores)
+    shares = [(flat > each).mean(axis=-1) for each in np.asarray(thresholds)]
     return np.stack(shares, axis=-1)
 
 
@@ -41,61 +75,85 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Array:
 
     Args:
         x: `[..., seeds, tasks]`.
-        y: `[..., seeds, tasks]`, with as many tasks.
+        y: `[..., seeds, tasks]`, of as many tasks.
 
     Returns:
         `[...]`.
     """
-    left = np.asarray(x, np.float64)[..., :, None, :]
-    right = np.asarray(y, np.float64)[..., None, :, :]
-    better = (left > right) + 0.5 * (left == right)
-    return np.asarray(better.mean(axis=(-3, -2, -1)))
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    better = []
+    for task in range(x.shape[-1]):  # All tasks at once would need much memory.
+        difference = x[..., :, None, task] - y[..., None, :, task]
+        better.append((0.5 + 0.5 * np.sign(difference)).mean(axis=(-2, -1)))
+    return np.asarray(np.mean(better, axis=0))
 
 
-def normalised_iqm(scores: ArrayLike, reference: ArrayLike) -> Array:
-    """Interquartile mean of scores divided by the mean of the reference's.
-
-    Args:
-        scores: `[..., seeds, tasks]`.
-        reference: `[..., seeds, tasks]`, SAC-N's on Brax.
-
-    Returns:
-        `[...]`.
-    """
-    scores = np.asarray(scores, np.float64)
-    middle = interquartile_mean(scores.reshape(*scores.shape[:-2], -1))
-    return middle / np.asarray(reference, np.float64).mean(axis=(-2, -1))
-
-
-def interval(
+def stratified_bootstrap(
     of: Callable[..., Array],
     *samples: ArrayLike,
     level: float = 0.95,
     resamples: int = 10_000,
     seed: int = 0,
 ) -> Array | None:
-    """Percentile interval of a value of one or more samples, each drawn anew.
+    """Percentile interval of a value of one or more samples.
+
+    Each task of each sample is a stratum: its seeds are drawn anew, with replacement,
+    apart from those of the others.
 
     Args:
-        of: the value, from samples `[draws, seeds, tasks]` to `[draws, ...]`.
-        samples: `[seeds, tasks]` each.
+        of: the value, from samples `[resamples, seeds, tasks]` to `[resamples, ...]`.
+        samples: `[seeds, tasks]` each; numbers of seeds may differ.
         level: how probable the interval is to hold the value.
         resamples: how often all is drawn.
         seed: of the drawing: the same samples always give the same interval.
 
     Returns:
-        `[2, ...]`, the two ends; None if a sample has fewer than two seeds.
+        `[2, ...]`, its ends; None if a sample has fewer than two seeds, which say
+        nothing of the spread.
     """
     arrays = [np.asarray(sample, np.float64) for sample in samples]
     if any(len(array) < 2 for array in arrays):
         return None
-    generator = np.random.default_rng(seed)
-    values = []
-    for _ in range(0, resamples, 1_000):  # All at once would take much memory.
-        drawn = []
-        for array in arrays:
-            places = generator.integers(len(array), size=(1_000, *array.shape))
-            drawn.append(np.take_along_axis(array[None], places, axis=1))
-        values.append(of(*drawn))
-    tails = [50 * (1 - level), 50 * (1 + level)]
-    return np.asarray(np.percentile(np.concatenate(values), tails, axis=0))
+    ends = np.cumsum([array.shape[1] for array in arrays])
+
+    def statistic(*strata: Array, axis: int) -> Array:
+        # scipy hands over `[resamples, seeds]`, and wants resamples last.
+        starts = (0, *ends[:-1])
+        drawn = [
+            np.stack(strata[start:end], axis=axis)
+            for start, end in zip(starts, ends, strict=True)
+        ]
+        return np.moveaxis(of(*drawn), 0, -1)
+
+    interval = scipy.stats.bootstrap(
+        tuple(stratum for array in arrays for stratum in array.T),
+        statistic,
+        vectorized=True,
+        n_resamples=resamples,
+        confidence_level=level,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return np.array([interval.low, interval.high])
+
+
+def estimate(of: Callable[..., Array], *samples: ArrayLike) -> Interval:
+    """A value of one or more samples with its interval, see `stratified_bootstrap`.
+
+    Args:
+        of: the value, from samples `[..., seeds, tasks]` to `[...]`.
+        samples: `[seeds, tasks]` each.
+
+    Returns:
+        Without ends where there is no interval, empty where a sample is.
+    """
+    if not all(map(np.size, samples)):
+        return Interval(None, None, None)
+    ends = stratified_bootstrap(of, *samples)
+    low, high = (None, None) if ends is None else map(float, ends)
+    return Interval(float(of(*samples)), low, high)
+
+
+def _flat(scores: ArrayLike) -> Array:
+    scores = np.asarray(scores, np.float64)
+    return scores.reshape(*scores.shape[:-2], -1)
