@@ -35,7 +35,8 @@ def main() -> None:
     from rliable import library, metrics  # type: ignore[import-not-found]
 
     def estimate(samples, of, resamples=RESAMPLES):  # type: ignore[no-untyped-def]
-        np.random.seed(0)  # noqa: NPY002: rliable draws from the global generator.
+        # rliable draws from the global generator.
+        np.random.seed(0)  # noqa: NPY002
         values, ends = library.get_interval_estimates(
             {"": samples}, lambda *each: np.atleast_1d(of(*each)), reps=resamples
         )

@@ -2,13 +2,35 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.errors import UserError, writing
 from rewire_jax.storage.json_lines import raw
 
 _BEGIN, _END = b"\n<!-- digests of this report's files: ", b" -->\n"
+
+
+@contextmanager
+def replacing(page: Path, others: Sequence[Path]) -> Iterator[Path]:
+    """A new folder to write files into, which then replace those of the last time.
+
+    Args:
+      page: the page, in a folder that is made where missing.
+      others: the other files, in the same folder.
+
+    Raises:
+      UserError: the folder cannot be written, or as `replace`.
+    """
+    with writing(page.parent):
+        page.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=page.parent, prefix=".report-") as made:
+            new = Path(made)
+            yield new
+            sign(new / page.name)
+            replace(page, others, new)
 
 
 def sign(page: Path) -> None:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +81,7 @@ class Comparison:
         summaries: one for each run.
         score: what all of them are measured by.
         sources: where `Summary.published` is from.
+        base: the SAC-N run that normalises; None if scores are raw.
         raw: why scores are raw returns; None where SAC-N normalises them, and for
             scores that are not to be normalised.
         single: what learned one of the tasks alone, that forward transfer is measured
@@ -89,13 +91,14 @@ class Comparison:
     summaries: tuple[Summary, ...]
     score: Score
     sources: tuple[Source, ...]
+    base: RunData | None
     raw: str | None
     single: tuple[RunData, ...]
 
     @property
     def normalised(self) -> bool:
         """Whether scores are multiples of SAC-N's."""
-        return self.score.normalised and self.raw is None
+        return self.base is not None
 
     @property
     def unit(self) -> str:
@@ -113,12 +116,24 @@ class Comparison:
         return MEASURES | ({"transfer": "forward transfer"} if self.single else {})
 
 
-def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Comparison:
+def comparable(run: RunData) -> tuple[Any, ...]:
+    """What is equal in runs that share a table."""
+    settings = (run.settings.get(name, old) for name, old in _SHARED.items())
+    return (*settings, run.score.noun, run.tasks)
+
+
+def summarize(
+    runs: Sequence[RunData],
+    single: Sequence[RunData] = (),
+    names: Sequence[str] | None = None,
+) -> Comparison:
     """Summarizes comparable runs.
 
     Args:
         runs: one or more, complete or partial.
         single: finished runs of one task each, from which forward transfer is measured.
+        names: of the runs' configurations, all different: they label the runs, and the
+            paper's result of a method is that of the configuration of its name.
 
     Raises:
         UserError: there is no run, one is given twice, they are not comparable, or a
@@ -138,15 +153,12 @@ def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Compar
     sources = paper_results.sources(
         first.settings["scenario"], first.settings["backend"]
     )
-    methods = Counter(run.settings["method"] for run in runs)
+    labels = _labels(runs) if names is None else list(map(_shown, names))
     summaries = []
-    for run, label in zip(runs, _labels(runs), strict=True):
-        method = run.settings["method"]
-        # The paper has one result a method: it belongs to none of several variants.
-        alone = methods[method] == 1
-        theirs = tuple(s.results.get(method) if alone else None for s in sources)
+    for run, label, name in zip(runs, labels, names or _methods(runs), strict=True):
+        theirs = tuple(source.results.get(name) for source in sources)
         summaries.append(_summary(run, label, base, areas, theirs))
-    return Comparison(tuple(summaries), first.score, sources, raw, tuple(single))
+    return Comparison(tuple(summaries), first.score, sources, base, raw, tuple(single))
 
 
 def _check(run: RunData, other: RunData, *names: str) -> None:
@@ -290,10 +302,21 @@ def _iqm(run: RunData, base: RunData | None) -> Interval:
     scores = final_scores(run, run.finished)
     if base is None:
         return estimate(statistics.interquartile_mean, scores)
-    if base is run:  # One draw of SAC-N is both.
-        return estimate(lambda each: statistics.normalised_iqm(each, each), scores)
-    divisor = final_scores(base, run.finished)
+    divisor = scores if base is run else final_scores(base, run.finished)
     return estimate(statistics.normalised_iqm, scores, divisor)
+
+
+def _methods(runs: Sequence[RunData]) -> list[str]:
+    """The runs' methods, empty where several runs share one.
+
+    The paper has one result a method: it belongs to none of several variants.
+    """
+    methods = [str(run.settings["method"]) for run in runs]
+    return [method if methods.count(method) == 1 else "" for method in methods]
+
+
+def _shown(name: str) -> str:
+    return paper_results.NAMES.get(name, name)
 
 
 def _labels(runs: Sequence[RunData]) -> list[str]:
@@ -302,8 +325,7 @@ def _labels(runs: Sequence[RunData]) -> list[str]:
     folder, times = folders.most_common(1)[0]
     if times > 1:
         raise UserError(f"{folder} is given twice")
-    methods = [str(run.settings["method"]) for run in runs]
-    methods = [paper_results.NAMES.get(method, method) for method in methods]
+    methods = [_shown(str(run.settings["method"])) for run in runs]
     names = [f"{m}: {r.folder.name}" for m, r in zip(methods, runs, strict=True)]
     paths = [f"{m}: {r.folder}" for m, r in zip(methods, runs, strict=True)]
     labels = []

@@ -102,7 +102,8 @@ def stratified_bootstrap(
 
     Args:
         of: the value, from samples `[resamples, seeds, tasks]` to `[resamples, ...]`.
-        samples: `[seeds, tasks]` each; numbers of seeds may differ.
+        samples: `[seeds, tasks]` each; numbers of seeds may differ. One that is given
+            twice, as the same array, is drawn once.
         level: how probable the interval is to hold the value.
         resamples: how often all is drawn.
         seed: of the drawing: the same samples always give the same interval.
@@ -111,7 +112,8 @@ def stratified_bootstrap(
         `[2, ...]`, its ends; None if a sample has fewer than two seeds, which say
         nothing of the spread.
     """
-    arrays = [np.asarray(sample, np.float64) for sample in samples]
+    unique = list({id(sample): sample for sample in samples}.values())
+    arrays = [np.asarray(sample, np.float64) for sample in unique]
     if any(len(array) < 2 for array in arrays):
         return None
     ends = np.cumsum([array.shape[1] for array in arrays])
@@ -119,11 +121,11 @@ def stratified_bootstrap(
     def statistic(*strata: Array, axis: int) -> Array:
         # scipy hands over `[resamples, seeds]`, and wants resamples last.
         starts = (0, *ends[:-1])
-        drawn = [
-            np.stack(strata[start:end], axis=axis)
-            for start, end in zip(starts, ends, strict=True)
-        ]
-        return np.moveaxis(of(*drawn), 0, -1)
+        drawn = {
+            id(sample): np.stack(strata[start:end], axis=axis)
+            for sample, start, end in zip(unique, starts, ends, strict=True)
+        }
+        return np.moveaxis(of(*(drawn[id(sample)] for sample in samples)), 0, -1)
 
     interval = scipy.stats.bootstrap(
         tuple(stratum for array in arrays for stratum in array.T),
