@@ -34,7 +34,7 @@ def main() -> None:
     """Computes and writes the numbers."""
     from rliable import library, metrics  # type: ignore[import-not-found]
 
-    def estimate(samples, of, resamples=RESAMPLES):  # type: ignore[no-untyped-def]
+    def estimate(samples, of, resamples=RESAMPLES):
         # rliable draws from the global generator.
         np.random.seed(0)  # noqa: NPY002
         values, ends = library.get_interval_estimates(
@@ -42,14 +42,14 @@ def main() -> None:
         )
         return {"value": values[""].tolist(), "interval": ends[""].tolist()}
 
-    def ratio(sample, normaliser):  # type: ignore[no-untyped-def]
+    def ratio(sample, normaliser):
         return metrics.aggregate_iqm(sample) / metrics.aggregate_mean(normaliser)
 
     made = scores()
     methods = {name: made[name] for name in ("a", "b", "c")}
     thresholds = np.linspace(0.0, 2.5, 26)
 
-    def profile(sample):  # type: ignore[no-untyped-def]
+    def profile(sample):
         return library.score_distributions(sample, thresholds)
 
     result = {

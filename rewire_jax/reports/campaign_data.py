@@ -90,7 +90,7 @@ def read_campaign_data(file: str | Path, out: str | Path) -> CampaignData:
     evaluated, finished, unreadable = {}, {}, {}
     for job in jobs:
         name = job.run.name
-        if not (job.folder / "results.jsonl").exists():
+        if name not in known.done and not (job.folder / "results.jsonl").exists():
             continue
         try:
             evaluated[name] = read_rows(job.folder)

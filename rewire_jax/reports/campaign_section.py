@@ -2,7 +2,6 @@
 
 import base64
 from collections import Counter, defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -50,7 +49,7 @@ class Section:
         """Of the configurations, in the order of the tables."""
         return [summary.label for summary in self.report.numbers.summaries]
 
-    def pictures(self) -> Iterator[tuple[str, str]]:
+    def pictures(self) -> list[tuple[str, str]]:
         """Title and data URI of each picture."""
         import matplotlib
 
@@ -63,10 +62,16 @@ class Section:
             folder = Path(made)
             self.report.draw(folder)
             _draw_profiles(self.report, folder / "profiles.png")
-            for name, title in titles.items():
-                if (folder / name).exists():
-                    text = base64.b64encode((folder / name).read_bytes()).decode()
-                    yield title, f"data:image/png;base64,{text}"
+            return [
+                (title, _uri(folder / name))
+                for name, title in titles.items()
+                if (folder / name).exists()
+            ]
+
+
+def _uri(picture: Path) -> str:
+    text = base64.b64encode(picture.read_bytes()).decode()
+    return f"data:image/png;base64,{text}"
 
 
 def sections(data: CampaignData) -> list[Section]:
@@ -165,7 +170,7 @@ def _scores(comparison: Comparison, summary: Summary) -> tuple[Array, ...]:
 
 
 def _ratio(scores: Array, divisor: Array | None = None) -> Array:
-    """Scores `[..., seeds, tasks]`, over the mean of a divisor `[..., seeds, tasks]`."""
+    """Scores over the mean of a divisor, both `[..., seeds, tasks]`."""
     if divisor is None:
         return scores
     return scores / statistics.mean(divisor)[..., None, None]
