@@ -13,9 +13,8 @@ from rewire_jax.reports.campaign_data import CampaignData
 from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import (
     Comparison,
-    Summary,
     comparable,
-    final_scores,
+    final_samples,
     summarize,
 )
 from rewire_jax.reports.spread import Interval
@@ -32,14 +31,12 @@ class Section:
     """Comparable configurations, of which at least one seed is finished.
 
     Attributes:
-        scenario: its name.
         report: tables and pictures, as the report of runs has them.
         unfinished: a sentence for each configuration that lacks seeds.
         improvement: for each pair of configurations the probability that the first one
             is better; None for a configuration with itself, or without scores.
     """
 
-    scenario: str
     report: Report[Comparison]
     unfinished: tuple[str, ...]
     improvement: tuple[tuple[Interval | None, ...], ...]
@@ -89,28 +86,24 @@ def sections(data: CampaignData) -> list[Section]:
         (run.settings.scenario, run.configuration) for run in data.campaign.runs
     )
     groups: dict[tuple[object, ...], dict[str, RunData]] = defaultdict(dict)
-    lacking: dict[tuple[object, ...], list[str]] = defaultdict(list)
-    for key, count in planned.items():
-        if key not in runs:
-            continue
-        name, run = key[1], merged(runs[key])
-        groups[comparable(run)][name] = run
-        if len(run.seeds) < count:
-            done = f"{len(run.seeds)} of {several(count, 'seed')}"
-            lacking[comparable(run)].append(
-                f"{name}: {done} finished; numbers are of these."
-            )
-    return [
-        _section(list(group.values()), list(group), lacking[key])
-        for key, group in groups.items()
-    ]
+    for scenario, name in planned:
+        if (scenario, name) in runs:
+            run = merged(runs[scenario, name])
+            groups[comparable(run)][name] = run
+    return [_section(group, planned) for group in groups.values()]
 
 
-def _section(runs: list[RunData], names: list[str], lacking: list[str]) -> Section:
-    comparison = summarize(runs, names=names)
-    scores = [
-        final_scores(each.run, each.run.finished) for each in comparison.summaries
-    ]
+def _section(group: dict[str, RunData], planned: Counter[tuple[str, str]]) -> Section:
+    """The section of runs by configuration; `planned` are numbers of seeds."""
+    comparison = summarize([*group.values()], names=[*group])
+    first = comparison.summaries[0].run
+    scenario, unfinished = str(first.settings["scenario"]), []
+    for name, summary in zip(group, comparison.summaries, strict=True):
+        done, count = len(summary.run.seeds), planned[scenario, name]
+        if done < count:
+            said = f"{done} of {several(count, 'seed')}"
+            unfinished.append(f"{summary.label}: only {said} finished.")
+    scores = [final_samples(s.run, None)[0] for s in comparison.summaries]
     count = len(scores)
     pairs: list[list[Interval | None]] = [[None] * count for _ in range(count)]
     for i in range(count):
@@ -120,9 +113,8 @@ def _section(runs: list[RunData], names: list[str], lacking: list[str]) -> Secti
                 pairs[i][j] = estimate(of, scores[i], scores[j])
                 pairs[j][i] = _complement(pairs[i][j])
     return Section(
-        scenario=str(runs[0].settings["scenario"]),
-        report=run_report.make(comparison, runs[0].folder.parent),
-        unfinished=tuple(lacking),
+        report=run_report.make(comparison, first.folder.parent),
+        unfinished=tuple(unfinished),
         improvement=tuple(map(tuple, pairs)),
     )
 
@@ -142,7 +134,7 @@ def _draw_profiles(report: Report[Comparison], path: Path) -> None:
     from rewire_jax.reports.profile_plot import Profile, profiles
 
     comparison = report.numbers
-    scores = [_scores(comparison, each) for each in comparison.summaries]
+    scores = [final_samples(s.run, comparison.base) for s in comparison.summaries]
     values = np.concatenate([_ratio(*each).ravel() for each in scores])
     if not values.size:
         return
@@ -158,15 +150,6 @@ def _draw_profiles(report: Report[Comparison], path: Path) -> None:
         if samples[0].size
     ]
     profiles(lines, thresholds, comparison.unit, report.title, path)
-
-
-def _scores(comparison: Comparison, summary: Summary) -> tuple[Array, ...]:
-    """Scores at the end, and those of SAC-N where it divides them."""
-    run, base = summary.run, comparison.base
-    scores = final_scores(run, run.finished)
-    if base is None:
-        return (scores,)
-    return scores, scores if base is run else final_scores(base, run.finished)
 
 
 def _ratio(scores: Array, divisor: Array | None = None) -> Array:

@@ -288,31 +288,28 @@ def _tasks(run: RunData, score: Score, own: dict[str, Array]) -> Tasks:
     )
 
 
-def final_scores(run: RunData, done: int) -> Array:
-    """Scores of the first tasks after as many stages, `[seeds, done]`.
+def final_samples(run: RunData, base: RunData | None) -> tuple[Array, ...]:
+    """What statistics of a run are estimated from.
 
-    Diverged seeds and those with NaN are left out.
+    Returns:
+        Scores after the last finished stage, `[seeds, tasks]`, and those of SAC-N after
+        as many, where it divides them. For SAC-N itself both are the same array.
+        Diverged seeds and those with NaN are left out.
     """
+    scores = _final(run, run.finished)
+    if base is None:
+        return (scores,)
+    return scores, scores if run is base else _final(base, run.finished)
+
+
+def _final(run: RunData, done: int) -> Array:
     scores = metrics.final(_matrix(run, done))
     return scores[~np.isnan(scores).any(axis=1)]
 
 
 def _iqm(run: RunData, base: RunData | None) -> Interval:
-    """Interquartile mean of what was reached; drawn anew with it is what divides it."""
-    scores = final_scores(run, run.finished)
-    if base is None:
-        return estimate(statistics.interquartile_mean, scores)
-    divisor = scores if base is run else final_scores(base, run.finished)
-    return estimate(statistics.normalised_iqm, scores, divisor)
-
-
-def _methods(runs: Sequence[RunData]) -> list[str]:
-    """The runs' methods, empty where several runs share one.
-
-    The paper has one result a method: it belongs to none of several variants.
-    """
-    methods = [str(run.settings["method"]) for run in runs]
-    return [method if methods.count(method) == 1 else "" for method in methods]
+    of = statistics.normalised_iqm if base else statistics.interquartile_mean
+    return estimate(of, *final_samples(run, base))
 
 
 def _shown(name: str) -> str:
