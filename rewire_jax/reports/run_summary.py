@@ -312,6 +312,15 @@ def _iqm(run: RunData, base: RunData | None) -> Interval:
     return estimate(of, *final_samples(run, base))
 
 
+def _methods(runs: Sequence[RunData]) -> list[str]:
+    """The runs' methods, empty where several runs share one.
+
+    The paper has one result a method: it belongs to none of several variants.
+    """
+    methods = [str(run.settings["method"]) for run in runs]
+    return [method if methods.count(method) == 1 else "" for method in methods]
+
+
 def _shown(name: str) -> str:
     return paper_results.NAMES.get(name, name)
 
