@@ -19,6 +19,7 @@ from rewire_jax.envs.scenarios import (
 from rewire_jax.methods import register_method
 from rewire_jax.nn import MLP, Permute, RewiredDense, permute
 from rewire_jax.rendering.render import render
+from rewire_jax.reports.campaign_report import write_campaign_report
 from rewire_jax.reports.write import write_report
 from rewire_jax.run.campaign import campaign
 from rewire_jax.run.campaign_status import campaign_status
@@ -64,5 +65,6 @@ __all__ = [
     "submit",
     "sweep",
     "train",
+    "write_campaign_report",
     "write_report",
 ]

@@ -8,6 +8,7 @@ import tyro
 
 from rewire_jax.cli.flags import Flags
 from rewire_jax.core.formatting import seconds
+from rewire_jax.reports.campaign_report import write_campaign_report
 from rewire_jax.run.campaign import campaign
 from rewire_jax.run.campaign_status import campaign_status
 from rewire_jax.run.campaign_submit import Cluster, submit
@@ -19,6 +20,7 @@ class Campaign(Flags):
 
     The runs are trained side by side, in order of priority. A stopped campaign goes on
     with the same command. A run that fails twice is set aside, and the others go on.
+    At the end, the campaign's folder contains a report of the results so far.
 
     Attributes:
       file: TOML file of the campaign.
@@ -42,9 +44,11 @@ class Campaign(Flags):
     submit: Cluster | None = None
 
     def __call__(self) -> None:
-        """Trains or submits, then prints the campaign's status."""
+        """Trains and writes the report, or submits; then prints the campaign's status."""
         limit = None if self.limit is None else seconds(self.limit)
-        if self.submit is not None and not self.status:
+        if self.status:
+            print(campaign_status(self.file, self.out))
+        elif self.submit is not None:
             jobs = submit(
                 self.file,
                 self.out,
@@ -54,12 +58,14 @@ class Campaign(Flags):
                 retry=self.retry,
             )
             print(f"submitted jobs: {', '.join(jobs) or 'none'}")
-        elif not self.status:
-            campaign(
+            print(campaign_status(self.file, self.out))
+        else:
+            folder = campaign(
                 self.file,
                 self.out,
                 limit=limit,
                 workers=self.workers,
                 retry=self.retry,
             )
-        print(campaign_status(self.file, self.out))
+            report = write_campaign_report(self.file, folder)
+            print(report.data.status, report.page, report.returns, sep="\n")

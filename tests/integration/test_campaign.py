@@ -109,6 +109,7 @@ def test_submitted_here(file, undisturbed, tmp_path):
     out = tmp_path / "out"
     ran = train(file, out, "--submit", "local", "--workers", "2")
     assert ran.returncode == 0, ran.stderr
+    assert train(file, out).returncode == 0  # writes the tables
     assert table(out) == table(undisturbed)
     assert rows(out) == rows(undisturbed)
 
