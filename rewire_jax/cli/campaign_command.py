@@ -44,7 +44,7 @@ class Campaign(Flags):
     submit: Cluster | None = None
 
     def __call__(self) -> None:
-        """Trains and writes the report, or submits; then prints the campaign's status."""
+        """Trains and reports, or submits; then prints the status of the campaign."""
         limit = None if self.limit is None else seconds(self.limit)
         if self.status:
             print(campaign_status(self.file, self.out))
