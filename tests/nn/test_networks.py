@@ -139,13 +139,15 @@ def test_layer_norm_is_flaxs_before_each_activation():
     assert not np.allclose(got, networks.mlp(layers, x), atol=1e-2)
 
 
-@pytest.mark.parametrize("value", [0.0, 1e4 / 3])
-def test_equal_neurons_are_normalized_to_zero(value):
-    x = jnp.full(7, value)
+def test_nearly_equal_neurons_are_normalized():
+    # The mean of squares minus the square of the mean is negative in some rows.
+    x = 3e3 + jax.random.normal(KEY, (100, 7)) * 1e-3
+    fast = jnp.mean(x**2, axis=-1) - jnp.mean(x, axis=-1) ** 2
+    assert jnp.min(fast) < -1e-6
     value, slope = jax.value_and_grad(
-        lambda x: jnp.sum(networks.normalize_and_activate(x) * jnp.arange(7.0))
+        lambda x: jnp.sum(networks.normalize_and_activate(x) ** 2)
     )(x)
-    np.testing.assert_allclose(value, 0, atol=1e-5)
+    assert np.isfinite(value)
     assert np.isfinite(slope).all()
 
 
@@ -155,7 +157,9 @@ def test_the_order_of_hidden_neurons_does_not_matter(network):
     x = jax.random.normal(jax.random.key(1), (20, 3))
     play = networks.policy_of(network)
     expected = play(layers, x)
-    for index, order in enumerate(np.random.default_rng(0).permuted([range(8)] * 2, 1)):
+    random = np.random.default_rng(0)
+    for index in range(2):
+        order = random.permutation(8)
         here, following = layers[index : index + 2]
         layers[index] = networks.Linear(here.weight[order], here.bias[order])
         layers[index + 1] = following._replace(weight=following.weight[:, order])
