@@ -101,7 +101,7 @@ def test_a_run_trains_the_network(name: str, tmp_path: Path) -> None:
     folder = rewire_jax.train(settings, tmp_path / "run")
     rows = (folder / "results.jsonl").read_text().splitlines()
     results = [json.loads(row) for row in rows]
-    assert len(results) == 2 * 2
+    assert len(results) == (1 + 2) * 2  # untrained, then after each task
     assert not any(row["diverged"] for row in results)
     assert all(np.isfinite(row["return"]) for row in results)
 
