@@ -21,6 +21,8 @@ CriticEntropy = Literal["sample", "batch_mean"]
 """The entropy in a critic's target: of each action, or the mean over the batch."""
 PolicyStates = Literal["current", "both"]
 """States in the policy's losses: the first of each transition, or both."""
+Network = Literal["mlp", "layer_norm"]
+"""Networks of policy and critics: plain, or with normalised hidden layers."""
 
 
 def traced(default: int) -> Any:
@@ -75,6 +77,9 @@ class SacSettings:
       target_rate: share by which a target update moves the targets to the critics.
       hidden: neurons in each hidden layer.
       depth: hidden layers of the policy and of each critic.
+      network: networks of the policy and of both critics: "mlp" as in the paper;
+        "layer_norm" also normalises each hidden layer's output over its neurons before
+        the activation, to mean 0 and variance 1, without learned scale and offset.
       batch_size: transitions in one update.
       policy_delay: critic updates for each update of policy and temperature.
       target_delay: critic updates for each update of the targets.
@@ -100,6 +105,7 @@ class SacSettings:
     target_rate: float = 0.005
     hidden: int = 256
     depth: int = 3
+    network: Network = "mlp"
     batch_size: int = 256
     policy_delay: int = 2
     target_delay: int = 2

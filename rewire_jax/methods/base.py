@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.core.settings import SacSettings
+from rewire_jax.core.settings import Network, SacSettings
 from rewire_jax.core.transition import Batch
 
 Params = Any
@@ -25,7 +25,7 @@ Purpose = Literal["act", "critic", "policy"]
 
 
 class Spec(NamedTuple):
-    """Static sizes from which a method builds its arrays.
+    """Sizes and the network from which a method builds its policies; all static.
 
     Attributes:
       observations: length of an observation.
@@ -33,6 +33,8 @@ class Spec(NamedTuple):
       hidden: neurons in each hidden layer.
       depth: number of hidden layers.
       tasks: length of the task sequence.
+      network: see `SacSettings`. `networks.policy_of` gives the plain policy of a
+        network, `networks.ACTIVATIONS` what is between two layers.
     """
 
     observations: int
@@ -40,6 +42,7 @@ class Spec(NamedTuple):
     hidden: int
     depth: int
     tasks: int
+    network: Network = "mlp"
 
     def sizes(self, width: int = 0) -> list[int]:
         """Layer sizes of a plain policy, one MLP; `width` 0 means `hidden` neurons."""

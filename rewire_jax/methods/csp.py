@@ -71,9 +71,9 @@ def csp(spec: Spec, options: CspSettings) -> Method:
     design = Design(spec, options)
     return Method(
         init=partial(init, design),
-        distribution=distribution,
+        distribution=partial(distribution, design),
         policy=policy,
-        act=networks.mlp_policy,
+        act=networks.policy_of(spec.network),
         size=size,
         extras=partial(draw_extras, design),
         context=partial(draw_context, design),
@@ -153,13 +153,18 @@ def draw_context(
 
 
 def distribution(
-    params: Params, state: State, context: jax.Array, observation: jax.Array
+    design: Design,
+    params: Params,
+    state: State,
+    context: jax.Array,
+    observation: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std of the weighted policies; gradients reach the newest anchor."""
+    activation = networks.ACTIVATIONS[design.spec.network]
     newest = context[..., state.frozen, None]
     x = observation
     for index, layer in enumerate(params):
-        x = networks.activate(x) if index else x
+        x = activation(x) if index else x
         # A layer is linear in its parameters, so its outputs can be mixed.
         frozen = state.anchors[index]
         outputs = jnp.einsum("...i,aoi->...ao", x, frozen.weight) + frozen.bias

@@ -41,13 +41,14 @@ class Kept(NamedTuple):
 def ft1(spec: Spec, options: FinetuneSettings) -> Method:
     """The policy of the latest task is the policy of all tasks."""
     del options
+    act = networks.policy_of(spec.network)
     return Method(
         init=lambda key: (networks.init_mlp(key, spec.sizes()), ()),
-        distribution=lambda params, state, context, observation: networks.mlp_policy(
+        distribution=lambda params, state, context, observation: act(
             params, observation
         ),
         policy=lambda params, state, task: params,
-        act=networks.mlp_policy,
+        act=act,
         size=lambda params, state: jnp.asarray(count(params)),
     )
 

@@ -76,6 +76,7 @@ class State(NamedTuple):
 
 def packnet(spec: Spec, options: PackNetSettings) -> Method:
     """A task trains the free weights, prunes them, and finetunes those it keeps."""
+    act = networks.policy_of(spec.network)
 
     def init(key):
         params = networks.init_mlp(key, spec.sizes())
@@ -132,11 +133,11 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
 
     return Method(
         init=init,
-        distribution=lambda params, state, context, observation: networks.mlp_policy(
+        distribution=lambda params, state, context, observation: act(
             params, observation
         ),
         policy=policy,
-        act=networks.mlp_policy,
+        act=act,
         size=lambda params, state: jnp.asarray(count(params) + count(state.owners)),
         adjust_updates=adjust_updates,
         consolidate=consolidate,

@@ -8,8 +8,12 @@ layer i but the first
 biases in W and U, and column 0 computes only W_i h_{i-1}. Arrays have room for the
 whole sequence: the activations of columns that do not come before are zeros, so that
 their part of V neither matters nor learns.
+
+With `--network layer_norm`, each column normalises its hidden layers' x_i. The inner
+layers V are not normalised, which would cancel the scale a.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -17,7 +21,7 @@ import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import require, settings
-from rewire_jax.methods.base import Method, Shared, Spec
+from rewire_jax.methods.base import Act, Method, Shared, Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 
@@ -97,6 +101,7 @@ class Policy(NamedTuple):
 def pnn(spec: Spec, options: PnnSettings) -> Method:
     """Each task trains a new column; those before it are frozen."""
     width, tasks = options.width, spec.tasks
+    activation = networks.ACTIVATIONS[spec.network]
     sizes = spec.sizes(width)
 
     def init_column(key, place):
@@ -128,7 +133,7 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
 
     def distribution(params, state, context, observation):
         del context
-        return play(state.columns, params, state.learned, observation)
+        return play(state.columns, params, state.learned, observation, activation)
 
     def end_task(params, state, task, selection):
         del selection
@@ -152,21 +157,31 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
         init=init,
         distribution=distribution,
         policy=policy,
-        act=act,
+        act=act_of(spec.network),
         size=size,
         start_task=start_task,
         end_task=end_task,
     )
 
 
-def act(policy: Policy, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean and log-std, each `[..., actions]`, of a frozen column."""
-    (columns,), place = policy
-    return play(columns, at(columns, place), place, observation)
+@functools.cache
+def act_of(network: str) -> Act:
+    """How to act by a frozen column; always the same object for a network's name."""
+    activation = networks.ACTIVATIONS[network]
+
+    def act(policy: Policy, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        (columns,), place = policy
+        return play(columns, at(columns, place), place, observation, activation)
+
+    return act
 
 
 def play(
-    columns: Column, column: Column, place: jax.Array, observation: jax.Array
+    columns: Column,
+    column: Column,
+    place: jax.Array,
+    observation: jax.Array,
+    activation: networks.Activation,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std of a column; gradients flow only into this column.
 
@@ -175,6 +190,7 @@ def play(
       column: the column that is played.
       place: `[]`, its place in the sequence.
       observation: `[..., observations]`.
+      activation: of the hidden layers.
 
     Returns:
       Mean and log-std, each `[..., actions]`.
@@ -186,19 +202,25 @@ def play(
     nothing = [jnp.zeros(shape, observation.dtype) for _ in column.laterals]
 
     def join(place, earlier):
-        hidden, _ = run_column(at(columns, place), place, earlier, observation)
+        hidden, _ = run_column(
+            at(columns, place), place, earlier, observation, activation
+        )
         return [
             jax.lax.dynamic_update_slice_in_dim(joined, x, place * width, axis=-1)
             for joined, x in zip(earlier, hidden, strict=True)
         ]
 
     earlier = jax.lax.fori_loop(0, place, join, nothing)
-    _, output = run_column(column, place, earlier, observation)
+    _, output = run_column(column, place, earlier, observation, activation)
     return networks.gaussian(output)
 
 
 def run_column(
-    column: Column, place: jax.Array, earlier: list[jax.Array], observation: jax.Array
+    column: Column,
+    place: jax.Array,
+    earlier: list[jax.Array],
+    observation: jax.Array,
+    activation: networks.Activation,
 ) -> tuple[list[jax.Array], jax.Array]:
     """A column's hidden activations and output.
 
@@ -208,6 +230,7 @@ def run_column(
       earlier: for each hidden layer the activations `[..., slots * width]` of the
         columns before it, side by side, then zeros.
       observation: `[..., observations]`.
+      activation: of the hidden layers.
 
     Returns:
       Activations `[..., width]` of each hidden layer, and `[..., 2 * actions]`.
@@ -216,7 +239,7 @@ def run_column(
     x = networks.affine(first, observation)
     hidden = []
     for layer, lateral, below in zip(layers, column.laterals, earlier, strict=True):
-        x = networks.activate(x)
+        x = activation(x)
         hidden.append(x)
         inner = networks.activate((lateral.scale * below) @ lateral.inner.T)
         side = networks.affine(lateral.outer, inner)

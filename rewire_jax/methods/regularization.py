@@ -136,12 +136,13 @@ def ewc(spec: Spec, options: EwcSettings) -> Method:
 
     F is the sum of the finished tasks' diagonals of the Fisher information.
     """
+    activation = networks.ACTIVATIONS[spec.network]
 
     def consolidate(key, params, state, task, tools):
         del task
         states = tools.sample(key, options.fisher_states).observation
         importance = jax.tree.map(
-            jnp.add, state.importance, fisher_diagonal(params, states)
+            jnp.add, state.importance, fisher_diagonal(params, states, activation)
         )
         return params, State(params, importance)
 
@@ -176,7 +177,9 @@ def _pulled(
 
 
 def fisher_diagonal(
-    layers: tuple[Linear, ...], states: jax.Array
+    layers: tuple[Linear, ...],
+    states: jax.Array,
+    activation: networks.Activation = networks.activate,
 ) -> tuple[Linear, ...]:
     """Diagonal of the Fisher information of a policy's Gaussian, in closed form.
 
@@ -189,6 +192,7 @@ def fisher_diagonal(
     Args:
       layers: layers of a plain policy.
       states: `[states, observations]`.
+      activation: what is between two layers.
 
     Returns:
       One number for each weight and bias, shaped like `layers`.
@@ -197,7 +201,7 @@ def fisher_diagonal(
     def scaled(biases, state):
         # The squares of this vector's derivatives are the terms of the sum.
         shifted = map(Linear, [layer.weight for layer in layers], biases)
-        mean, log_std = networks.mlp_policy(list(shifted), state)
+        mean, log_std = networks.mlp_policy(list(shifted), state, activation)
         std = jnp.exp(log_std)
         scale = jax.lax.stop_gradient(jnp.sqrt(std**2 + ADDED_VARIANCE))
         return jnp.concatenate([mean / scale, jnp.sqrt(2.0) * std / scale])
@@ -209,7 +213,7 @@ def fisher_diagonal(
             of_bias = jnp.sum(jacobian**2, axis=0)
             # A weight's derivatives are its bias's times the layer's input.
             diagonal.append(Linear(jnp.outer(of_bias, x**2), of_bias))
-            x = networks.activate(networks.affine(layer, x))
+            x = activation(networks.affine(layer, x))
         clamped = jax.tree.map(lambda f: jnp.maximum(f, LEAST_FISHER), tuple(diagonal))
         return jax.tree.map(jnp.add, total, clamped), None
 

@@ -50,7 +50,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         baseline=True,
         end_task=partial(end_task, design),
         policy=partial(policy, design),
-        act=networks.mlp_policy,
+        act=networks.policy_of(spec.network),
         size=partial(size, design),
     )
 
@@ -111,6 +111,7 @@ def forward(
     observation: jax.Array,
 ) -> Gaussian:
     """Returns the wired policy of a mode with `scores` `[L, n]` (Eq. 2)."""
+    activation = networks.ACTIVATIONS[design.spec.network]
     x = observation
     for layer, v in zip(params.hidden, scores, strict=True):
         key, drop_key = jax.random.split(key)
@@ -118,7 +119,7 @@ def forward(
         # The authors drop out before the permutation. Only the variance of the scores'
         # gradient differs.
         x = _dropout(drop_key, x, design.options.dropout)
-        x = networks.activate(x)
+        x = activation(x)
     head = at(params.heads, design.head_slot(state))
     return networks.gaussian(networks.affine(head, x))
 
@@ -219,7 +220,8 @@ def inspect(
     """Mean KL between modes, without noise and dropout; and the alignment loss."""
     modes, valid = design.modes, design.valid()
     policies = mode_policies(design, params, state)
-    gaussians = jax.vmap(networks.mlp_policy, (0, None))(policies, observation)
+    act = networks.policy_of(design.spec.network)
+    gaussians = jax.vmap(act, (0, None))(policies, observation)
     against = jax.vmap(gaussian_kl, (None, 0))
     pairs = jnp.mean(jax.vmap(against, (0, None))(gaussians, gaussians), axis=-1)
     # The divergence of a mode from itself is 0.

@@ -3,8 +3,15 @@
 Parameters are stored as a tuple of `Linear`, a layer each: methods reorder, mix and
 prune them layer by layer. `MLP` is the Flax module of the same network;
 `as_variables` and `as_layers` rename one form into the other without a copy.
+
+The networks of `ACTIVATIONS` differ only in what is between two layers. It has no
+parameters, so the stored form is the same. It treats all neurons alike, so the order of
+a hidden layer's neurons does not matter: permuting the rows of its weight and bias, and
+the columns of the next layer's weight, leaves the output as it is. So a rewired network
+is an ordinary one with either of them.
 """
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -39,9 +46,30 @@ def init_linear(key: jax.Array, inputs: int, outputs: int) -> Linear:
     )
 
 
+Activation = Callable[[jax.Array], jax.Array]
+"""What is between two layers, `[..., neurons]` -> `[..., neurons]`."""
+
+
 def activate(x: jax.Array) -> jax.Array:
     """LeakyReLU with slope 0.2, as in all networks of the paper's experiments."""
     return jax.nn.leaky_relu(x, 0.2)
+
+
+def normalize_and_activate(x: jax.Array) -> jax.Array:
+    """LeakyReLU of x with mean 0 and variance 1 over its last axis.
+
+    The first part is Flax's `LayerNorm(use_scale=False, use_bias=False)`.
+    """
+    # The variance from squares alone, the default, may come out negative.
+    variance = jnp.var(x, axis=-1, keepdims=True)
+    return activate(jax.nn.standardize(x, variance=variance, epsilon=1e-6))
+
+
+ACTIVATIONS: Mapping[str, Activation] = {
+    "mlp": activate,
+    "layer_norm": normalize_and_activate,
+}
+"""By the names of `SacSettings.network`."""
 
 
 def affine(layer: Linear, x: jax.Array) -> jax.Array:
@@ -118,7 +146,7 @@ class MLP(nn.Module):
     """
 
     features: Sequence[int]
-    activation: Callable[[jax.Array], jax.Array] = activate
+    activation: Activation = activate
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -161,9 +189,11 @@ def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
     return as_layers(MLP(sizes[1:]).init(key, jnp.zeros(sizes[0])))
 
 
-def mlp(layers: Sequence[Linear], x: jax.Array) -> jax.Array:
+def mlp(
+    layers: Sequence[Linear], x: jax.Array, activation: Activation = activate
+) -> jax.Array:
     """Applies the `MLP` with these layers, `[..., inputs]` -> `[..., outputs]`."""
-    network = MLP([layer.bias.shape[-1] for layer in layers])
+    network = MLP([layer.bias.shape[-1] for layer in layers], activation)
     output: jax.Array = network.apply(as_variables(layers), x)  # type: ignore[assignment]
     return output
 
@@ -174,9 +204,17 @@ def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:
     return mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
 
 
-def mlp_policy(layers: Sequence[Linear], observation: jax.Array):
+def mlp_policy(
+    layers: Sequence[Linear], observation: jax.Array, activation: Activation = activate
+) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std, each `[..., actions]`, of a plain MLP policy."""
-    return gaussian(mlp(layers, observation))
+    return gaussian(mlp(layers, observation, activation))
+
+
+@functools.cache
+def policy_of(network: str) -> Callable[..., tuple[jax.Array, jax.Array]]:
+    """`mlp_policy` with a network's activation; always the same object for a name."""
+    return functools.partial(mlp_policy, activation=ACTIVATIONS[network])
 
 
 def sample_action(

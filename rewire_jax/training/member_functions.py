@@ -135,7 +135,7 @@ class MemberFunctions:
 
         def q(context, observation, action):
             inputs = method.critic_input(context, observation)
-            return sac.q_values(learner.critic, inputs, action)
+            return sac.q_values(learner.critic, inputs, action, member.sac.network)
 
         params, method_state = method.consolidate(
             self.keys(member, index).consolidate,

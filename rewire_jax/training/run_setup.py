@@ -75,13 +75,14 @@ class Plan(NamedTuple):
 
 
 def make_spec(settings: Settings, environment: Environment | HostEnvironment) -> Spec:
-    """Returns the static sizes from which a method is made."""
+    """Returns what a method is made from, besides its settings."""
     return Spec(
         observations=environment.observation_size,
         actions=environment.action_size,
         hidden=settings.sac.hidden,
         depth=settings.sac.depth,
         tasks=settings.tasks,
+        network=settings.sac.network,
     )
 
 

@@ -1,5 +1,6 @@
 """Soft Actor-Critic: losses and one update, for one member."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from rewire_jax.core.settings import SacSettings
+from rewire_jax.core.settings import Network, SacSettings
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods.base import Method, MethodState, Params, Spec
 from rewire_jax.nn import networks
@@ -70,17 +71,22 @@ def restart(learner: TrainState, sac: SacSettings) -> TrainState:
     )
 
 
-def q_values(critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
+def q_values(
+    critic: Any, inputs: jax.Array, action: jax.Array, network: Network
+) -> jax.Array:
     """Returns the values of both critics, `[2, batch]`.
 
     Args:
       critic: layers of both.
       inputs: `[batch, observations + extra]`, see `Method.critic_input`.
       action: `[batch, actions]`.
+      network: see `SacSettings`.
     """
+    activation = networks.ACTIVATIONS[network]
+    apply = jax.vmap(functools.partial(networks.mlp, activation=activation))
     inputs = jnp.concatenate([inputs, action], axis=-1)
     # Of one input for both, XLA would make one product, then transpose it in two.
-    return jax.vmap(networks.mlp)(critic, jnp.stack([inputs, inputs]))[..., 0]
+    return apply(critic, jnp.stack([inputs, inputs]))[..., 0]
 
 
 class UpdateNoise(NamedTuple):
@@ -136,7 +142,7 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     )
     action, log_density = networks.sample_action(draw.noise[0], mean, log_std)
     following = method.critic_input(context, batch.next_observation)
-    q_next = jnp.min(q_values(learner.target, following, action), axis=0)
+    q_next = jnp.min(q_values(learner.target, following, action, sac.network), axis=0)
     if sac.critic_entropy == "batch_mean":
         log_density = jnp.mean(log_density)
     soft_value = q_next - jnp.exp(learner.log_temperature) * log_density
@@ -147,7 +153,7 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     target += sac.discount * jnp.where(ended, 0.0, soft_value)
     # The action that was taken is valued by what was stored with it.
     inputs = method.critic_input(batch.extras, batch.observation)
-    q = q_values(critic, inputs, batch.action)
+    q = q_values(critic, inputs, batch.action, sac.network)
     error = q - jax.lax.stop_gradient(target)
     return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
 
@@ -161,7 +167,7 @@ def _policy_loss(params, learner, batch, draw, method, sac):
     gaussian = method.distribution(params, method_state, context, observation)
     action, log_density = networks.sample_action(noise, *gaussian)
     inputs = method.critic_input(context, observation)
-    q = jnp.min(q_values(learner.critic, inputs, action), axis=0)
+    q = jnp.min(q_values(learner.critic, inputs, action, sac.network), axis=0)
     entropy = -jnp.mean(log_density)
     loss = -jnp.exp(learner.log_temperature) * entropy - jnp.mean(q)
     penalty, metrics = method.penalty(

@@ -49,7 +49,11 @@ def leaky(x):
     return np.where(x > 0, x, 0.2 * x)
 
 
-def played(columns, observation=OBSERVATION):
+def normalized(x):
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-6)
+
+
+def played(columns, observation=OBSERVATION, between=leaky):
     """The last column's policy, from unpadded concatenations in numpy."""
     observation = observation.astype(np.float64)
     before = [[] for _ in range(SPEC.depth)]
@@ -58,7 +62,7 @@ def played(columns, observation=OBSERVATION):
         x = observation @ first.weight.T + first.bias
         hidden = []
         for i, (weight, bias) in enumerate(layers):
-            x = leaky(x)
+            x = between(x)
             hidden.append(x)
             x = x @ weight.T + bias
             if place > 0:
@@ -105,6 +109,9 @@ def test_a_column_plays_as_with_unpadded_concatenations(learned, task):
     params, state, columns, starts = learned
     expected = played(columns[: task + 1])
     near(METHOD.act(METHOD.policy(params, state, task), OBSERVATION), expected)
+    policy = METHOD.policy(params, state, task)
+    expected = played(columns[: task + 1], between=lambda x: leaky(normalized(x)))
+    near(jax.jit(pnn.act_of("layer_norm"))(policy, OBSERVATION), expected)
     # In training, too.
     column, then = starts[task]
     expected = played([*columns[:task], column])
@@ -310,7 +317,7 @@ def test_policies_that_share_play_as_each_alone():
         stacked = map_own(lambda x: x[None], stacked)
         alone = rollout.episodes(
             plan.scenario.environment,
-            pnn.act,
+            pnn_of(plan).act,
             jax.tree.map(lambda x, r=row: x[r : r + 1], tasks),
             stacked,
             keys[place : place + 1, row : row + 1],

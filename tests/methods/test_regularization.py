@@ -103,20 +103,24 @@ POLICIES = {"inside": policy(), "clipped": policy((-0.5, 3.0))}
 policies = pytest.mark.parametrize("layers", POLICIES.values(), ids=POLICIES)
 
 
-@jax.jit
-def output_gradients(layers, state):
+@functools.partial(jax.jit, static_argnums=2)
+def output_gradients(layers, state, activation):
     """Each output of the network, unclipped, and its gradients: a plain loop."""
+
+    def network(layers):
+        return networks.mlp(layers, state, activation)
+
     outputs = range(2 * SPEC.actions)
-    return networks.mlp(layers, state), [
-        jax.grad(lambda w, i=i: networks.mlp(w, state)[i])(layers) for i in outputs
+    return network(layers), [
+        jax.grad(lambda w, i=i: network(w)[i])(layers) for i in outputs
     ]
 
 
-def brute_force(layers, observation):
+def brute_force(layers, observation, activation=networks.activate):
     """The closed form, state by state and output by output, in numpy."""
     total = jax.tree.map(lambda x: np.zeros(x.shape), layers)
     for state in observation:
-        output, gradients = output_gradients(layers, state)
+        output, gradients = output_gradients(layers, state, activation)
         diagonal = jax.tree.map(lambda x: np.zeros(x.shape), layers)
         for i in range(SPEC.actions):
             log_std = float(output[SPEC.actions + i])
@@ -146,6 +150,14 @@ def test_fisher_is_the_closed_form_of_each_output(layers):
     # The mean of clamped states, not the clamped mean: some of them are clamped.
     clamped = [brute_force(layers, [state])[0].weight == 1e-5 for state in observation]
     assert 0 < np.mean(clamped) < 1
+
+
+def test_fisher_of_normalized_layers():
+    layers, observation = POLICIES["inside"], states(1)
+    activation = networks.ACTIVATIONS["layer_norm"]
+    got = jax.jit(fisher_diagonal, static_argnums=2)(layers, observation, activation)
+    expected = brute_force(layers, observation, activation)
+    assert_near(got, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_fisher_where_the_deviation_is_least():

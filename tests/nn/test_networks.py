@@ -114,6 +114,60 @@ def test_the_module_applies_what_the_stored_layers_do():
     np.testing.assert_allclose(got, output, rtol=1e-4, atol=1e-5)
 
 
+class Normalized(nn.Module):
+    """Two hidden layers of Flax's own parts."""
+
+    @nn.compact
+    def __call__(self, x):
+        for number, size in enumerate((8, 6)):
+            x = nn.Dense(size, name=str(number))(x)
+            x = nn.LayerNorm(epsilon=1e-6, use_scale=False, use_bias=False)(x)
+            x = nn.leaky_relu(x, 0.2)
+        return nn.Dense(2, name="2")(x)
+
+
+def test_layer_norm_is_flaxs_before_each_activation():
+    layers = networks.init_mlp(KEY, [3, 8, 6, 2])
+    x = jax.random.normal(jax.random.key(1), (20, 3))
+    params = {
+        str(number): {"kernel": layer.weight.T, "bias": layer.bias}
+        for number, layer in enumerate(layers)
+    }
+    expected = jax.jit(Normalized().apply)({"params": params}, x)
+    got = networks.mlp(layers, x, networks.ACTIVATIONS["layer_norm"])
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+    assert not np.allclose(got, networks.mlp(layers, x), atol=1e-2)
+
+
+def test_nearly_equal_neurons_are_normalized():
+    # The mean of squares minus the square of the mean is negative in some rows.
+    x = 3e3 + jax.random.normal(KEY, (100, 7)) * 1e-3
+    fast = jnp.mean(x**2, axis=-1) - jnp.mean(x, axis=-1) ** 2
+    assert jnp.min(fast) < -1e-6
+    value, slope = jax.value_and_grad(
+        lambda x: jnp.sum(networks.normalize_and_activate(x) ** 2)
+    )(x)
+    assert np.isfinite(value)
+    assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("network", networks.ACTIVATIONS)
+def test_the_order_of_hidden_neurons_does_not_matter(network):
+    layers = list(networks.init_mlp(KEY, [3, 8, 8, 2]))
+    x = jax.random.normal(jax.random.key(1), (20, 3))
+    play = networks.policy_of(network)
+    expected = play(layers, x)
+    random = np.random.default_rng(0)
+    for index in range(2):
+        order = random.permutation(8)
+        here, following = layers[index : index + 2]
+        layers[index] = networks.Linear(here.weight[order], here.bias[order])
+        layers[index + 1] = following._replace(weight=following.weight[:, order])
+    np.testing.assert_allclose(play(layers, x), expected, rtol=0, atol=1e-6)
+    layers[1] = layers[1]._replace(weight=layers[1].weight[:, ::-1])
+    assert not np.allclose(play(layers, x), expected, atol=1e-3)
+
+
 def test_the_module_is_a_part_of_others():
     class Two(nn.Module):
         @nn.compact

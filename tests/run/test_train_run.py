@@ -99,12 +99,21 @@ def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
 def test_a_run_may_be_older_than_a_setting(run: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(run, tmp_path / "copy")
     header = json.loads((copy / "settings.json").read_text())
-    del header["settings"]["sac"]["noise_color"]
+    for name in ("noise_color", "network"):
+        del header["settings"]["sac"][name]
+    del header["spec"]["network"]
     (copy / "settings.json").write_text(json.dumps(header))
     train_run.train(tiny(), copy, resume=True)
-    sac = dataclasses.replace(tiny().sac, noise_color=1.0)
-    with pytest.raises(UserError, match=r"--noise-color was 0\.0, not 1\.0"):
-        train_run.train(dataclasses.replace(tiny(), sac=sac), copy, resume=True)
+    seen = jnp.array([0.3, -0.2])
+    actions = [rewire_jax.load_policy(folder, task=3)(seen) for folder in (run, copy)]
+    np.testing.assert_array_equal(*actions)
+    for change, says in (
+        ({"noise_color": 1.0}, r"--noise-color was 0\.0, not 1\.0"),
+        ({"network": "layer_norm"}, "--network"),
+    ):
+        sac = dataclasses.replace(tiny().sac, **change)
+        with pytest.raises(UserError, match=says):
+            train_run.train(dataclasses.replace(tiny(), sac=sac), copy, resume=True)
 
 
 class _Stop(Exception):

@@ -110,18 +110,21 @@ def wide(tree):
     return jax.tree.map(lambda x: np.asarray(x, np.float64), tree)
 
 
-def net(layers, x):
+def net(layers, x, network="mlp"):
     for number, (weight, bias) in enumerate(layers):
         x = x @ weight.T + bias
         if number < len(layers) - 1:
+            if network == "layer_norm":
+                variance = x.var(axis=-1, keepdims=True)
+                x = (x - x.mean(axis=-1, keepdims=True)) / np.sqrt(variance + 1e-6)
             x = np.where(x > 0, x, 0.2 * x)
     return x
 
 
-def both_q(critic, observation, action):
+def both_q(critic, observation, action, network="mlp"):
     x = np.concatenate([observation, action], axis=-1)
     pair = [jax.tree.map(lambda leaf, i=i: leaf[i], critic) for i in (0, 1)]
-    return np.stack([net(layers, x)[:, 0] for layers in pair])
+    return np.stack([net(layers, x, network)[:, 0] for layers in pair])
 
 
 def sample(params, observation):
@@ -165,27 +168,31 @@ def first_adam_step(gradient, rate):
 
 
 @pytest.mark.parametrize(
-    ("time_limit", "critic_entropy", "policy_states"),
+    ("time_limit", "critic_entropy", "policy_states", "network"),
     [
-        ("terminal", "sample", "current"),
-        ("bootstrap", "batch_mean", "current"),
-        ("terminal", "batch_mean", "both"),
+        ("terminal", "sample", "current", "mlp"),
+        ("bootstrap", "batch_mean", "current", "layer_norm"),
+        ("terminal", "batch_mean", "both", "mlp"),
     ],
 )
-def test_one_update_is_what_the_formulas_say(time_limit, critic_entropy, policy_states):
+def test_one_update_is_what_the_formulas_say(
+    time_limit, critic_entropy, policy_states, network
+):
     settings = dataclasses.replace(
         SETTINGS,
         time_limit=time_limit,
         critic_entropy=critic_entropy,
         policy_states=policy_states,
+        network=network,
     )
+    q_values = functools.partial(both_q, network=network)
     learner, batch, metrics = learner_and_batch(settings)
     after, metrics = update(learner, metrics, batch, 0, settings)
     old, new, batch = wide(learner), wide(after), wide(batch)
 
     temperature = 0.7
     action, density = sample(old.params, batch.next_observation)
-    soft = both_q(old.target, batch.next_observation, action).min(axis=0)
+    soft = q_values(old.target, batch.next_observation, action).min(axis=0)
     if critic_entropy == "sample":
         soft = soft - temperature * density
     else:
@@ -197,13 +204,13 @@ def test_one_update_is_what_the_formulas_say(time_limit, critic_entropy, policy_
     target = 3 * batch.reward + 0.9 * going * soft
 
     def critic_loss(critic):
-        q = both_q(critic, batch.observation, batch.action)
+        q = q_values(critic, batch.observation, batch.action)
         return sum(np.mean((each - target) ** 2) for each in q)
 
     if critic_entropy == "sample":
         loss = critic_loss(old.critic)
         assert metrics["critic_loss"] == pytest.approx(loss, rel=1e-4)
-    q = both_q(old.critic, batch.observation, batch.action)
+    q = q_values(old.critic, batch.observation, batch.action)
     assert metrics["q"] == pytest.approx(q.mean(), rel=1e-4)
     # Adam's first moments hold a tenth of the first gradient.
     policy_state, critic_state, temperature_state = new.optimizers
@@ -219,7 +226,7 @@ def test_one_update_is_what_the_formulas_say(time_limit, critic_entropy, policy_
     # The policy sees the critics that were just updated.
     def policy_loss(params, weight=PENALTY):
         action, density = sample(params, states)
-        q = both_q(new.critic, states, action).min(axis=0)
+        q = q_values(new.critic, states, action).min(axis=0)
         squares = sum(np.sum(leaf**2) for leaf in jax.tree.leaves(params))
         return np.mean(temperature * density - q) + weight * squares
 
@@ -374,7 +381,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
 
         def look(learner, seen):
             mean, _ = method.distribution(learner.params, (), (), seen)
-            return mean, sac.q_values(learner.critic, seen, jnp.tanh(mean))
+            return mean, sac.q_values(learner.critic, seen, jnp.tanh(mean), "mlp")
 
         return jax.vmap(look, (0, None))(learner, SEEN)
 
