@@ -20,7 +20,8 @@ import tyro
 import rewire_jax
 from experiments import suite
 from rewire_jax.cli import main
-from rewire_jax.cli.commands import COMMANDS, Flags
+from rewire_jax.cli.commands import COMMANDS
+from rewire_jax.cli.flags import Flags
 from rewire_jax.core.settings import SacSettings, Settings, flag, traced_fields
 from rewire_jax.methods import METHODS
 from rewire_jax.reports.table import to_markdown
@@ -65,12 +66,16 @@ def items(cls: type) -> Iterator[Item]:
             yield Item(field.name, kind, field.default, meaning)
 
 
+def said(marks: Sequence[Any], what: str) -> str | None:
+    """What an argument's marks for tyro say, for example its `name`."""
+    return next((x for x in (getattr(m, what, None) for m in marks) if x), None)
+
+
 def values(kind: Any) -> str:
     """The type of an argument in a word, or its choices."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is Annotated:
-        shown = [mark.metavar for mark in inner[1:] if hasattr(mark, "metavar")]
-        return shown[0] if shown else values(inner[0])
+        return said(inner[1:], "metavar") or values(inner[0])
     if origin is Literal:
         return ", ".join(f"`{value}`" for value in inner)
     if origin in (Union, type(int | None)):
@@ -95,7 +100,8 @@ def argument(item: Item) -> str:
     """The flag, or the name of a positional argument."""
     marks = getattr(item.kind, "__metadata__", ())
     placed = tyro.conf.Positional in marks
-    return f"`{item.name.upper() if placed else flag(item.name)}`"
+    name = said(marks, "name") or item.name
+    return f"`{name.upper() if placed else flag(name)}`"
 
 
 def arguments(cls: type, besides: type | None = None) -> str:

@@ -18,6 +18,7 @@ from rewire_jax.reports.plots import Array
 from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.titles import heading
 from rewire_jax.reports.training_curve_plot import Curve, evolution
+from rewire_jax.storage.merged_results import merged_curve
 from rewire_jax.storage.run_results import RunData, read_progress, read_run
 
 READING = (
@@ -180,11 +181,8 @@ def read(
 def gather(label: str, kept: Sequence[RunData], value: str | None = None) -> Trained:
     """Runs of one variant as one."""
     parts = [(read_progress(run, value) if value else run.curve)[0] for run in kept]
-    # A run that was stopped may have reports in between.
-    shared = set.intersection(*(set(x) for x, _ in parts))
-    values = [values[:, [at in shared for at in x]] for x, values in parts]
     return Trained(
-        Curve(label, np.array(sorted(shared)), np.concatenate(values)),
+        Curve(label, *merged_curve(parts)),
         tuple(seed for run in kept for seed in run.seeds),
         np.concatenate([run.scores[:, 0, 0] for run in kept]),
         kept[0].episode_length * float(kept[0].settings["envs"]),

@@ -19,7 +19,11 @@ from rewire_jax.envs.scenarios import (
 from rewire_jax.methods import register_method
 from rewire_jax.nn import MLP, Permute, RewiredDense, permute
 from rewire_jax.rendering.render import render
+from rewire_jax.reports.campaign_report import write_campaign_report
 from rewire_jax.reports.write import write_report
+from rewire_jax.run.campaign import campaign
+from rewire_jax.run.campaign_status import campaign_status
+from rewire_jax.run.campaign_submit import submit
 from rewire_jax.run.evaluation import evaluate, info
 from rewire_jax.run.interrupts import Stopped
 from rewire_jax.run.policies import load_policies, load_policy
@@ -41,6 +45,8 @@ __all__ = [
     "TaskChange",
     "UserError",
     "__version__",
+    "campaign",
+    "campaign_status",
     "evaluate",
     "info",
     "keep_compiled",
@@ -56,7 +62,9 @@ __all__ = [
     "register_method",
     "register_scenario",
     "render",
+    "submit",
     "sweep",
     "train",
+    "write_campaign_report",
     "write_report",
 ]

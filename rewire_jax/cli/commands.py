@@ -11,6 +11,8 @@ from typing import Annotated, get_args
 
 import tyro
 
+from rewire_jax.cli.campaign_command import Campaign
+from rewire_jax.cli.flags import Flags
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.envs.scenarios import Scenario, list_scenarios, make_scenario
 from rewire_jax.methods import METHODS
@@ -25,22 +27,6 @@ Axes = Annotated[
     tyro.conf.UseAppendAction,
     tyro.conf.arg(metavar="NAME VALUE..."),
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Flags:
-    """Flags of every command.
-
-    Attributes:
-      cache: folder for compiled programs; "off" keeps none. By default the folder in
-        JAX_COMPILATION_CACHE_DIR if it is set, else ~/.cache/rewire_jax.
-      debug: print the traceback of an error.
-      version: print the version and exit.
-    """
-
-    cache: str | None = None
-    debug: tyro.conf.FlagCreatePairsOff[bool] = False
-    version: tyro.conf.FlagCreatePairsOff[bool] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +284,7 @@ class List(Flags):
             print(f"{title}:", *entries, sep="\n  ")
 
 
-Command = Train | Sweep | Evaluate | Render | Report | Info | List
+Command = Train | Sweep | Campaign | Evaluate | Render | Report | Info | List
 COMMANDS: dict[str, type[Command]] = {
     kind.__name__.lower(): kind for kind in get_args(Command)
 }

@@ -1,6 +1,10 @@
-"""Formats numbers for tables and pictures."""
+"""Formats numbers for tables and pictures, and reads times."""
+
+import re
 
 import numpy as np
+
+from rewire_jax.core.errors import UserError
 
 
 def number(value: float | None, scale: float | None = None) -> str:
@@ -21,3 +25,19 @@ def number(value: float | None, scale: float | None = None) -> str:
 def short(value: float) -> str:
     """A setting's value in few characters: 1e-6, not 1e-06."""
     return f"{value:g}".replace("e-0", "e-").replace("e+0", "e+")
+
+
+def seconds(text: str) -> float:
+    """Seconds of a time such as 150m, 2h30m or 90s.
+
+    Raises:
+        UserError: it is not such a time, or it is 0.
+    """
+    found = re.fullmatch(r"(?:(\d+)h)?(?:(\d+)m)?(?:(\d+)s)?", text.strip())
+    hours, minutes, rest = (
+        (int(part or 0) for part in found.groups()) if found else [0] * 3
+    )
+    total = 3600 * hours + 60 * minutes + rest
+    if not total:
+        raise UserError(f"{text!r} is not a time: write it like 150m, 2h30m or 90s")
+    return float(total)

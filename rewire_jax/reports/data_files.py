@@ -8,10 +8,17 @@ from collections.abc import Sequence
 from typing import Any
 
 
-def csv_text(rows: Sequence[dict[str, Any]]) -> str:
-    """CSV of rows that all have the same columns; None and NaN are left empty."""
+def csv_text(
+    rows: Sequence[dict[str, Any]], columns: Sequence[str] | None = None
+) -> str:
+    """CSV of rows that all have the same columns; None and NaN are left empty.
+
+    Args:
+        rows: values by column.
+        columns: needed where there may be no rows.
+    """
     file = io.StringIO()
-    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+    writer = csv.DictWriter(file, columns or list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(_without_nan(rows))
     return file.getvalue()

@@ -3,15 +3,10 @@
 A matrix is `[..., stages, tasks]`: entry `[s, t]` is the score on task `t` after
 training on task `s`, so a whole sequence of T tasks gives `[..., T, T]`. The measures
 are those of the paper's section 4.1 and appendix A.3, and of Continual World (Wołczyk
-et al. 2021, arXiv 2105.10919), whose forgetting has the other sign; interquartile mean
-and interval are those of Agarwal et al., "Deep Reinforcement Learning at the Edge of
-the Statistical Precipice" (NeurIPS 2021).
+et al. 2021, arXiv 2105.10919), whose forgetting has the other sign.
 """
 
-from collections.abc import Callable
-
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 Scores = NDArray[np.float64]
@@ -151,59 +146,3 @@ def area_transfer(areas: ArrayLike, alone: ArrayLike) -> Scores:
     room = 1.0 - alone
     possible = room > 0
     return np.where(possible, (areas - alone) / np.where(possible, room, 1.0), np.nan)
-
-
-def interquartile_mean(values: ArrayLike) -> Scores:
-    """Mean of the middle half: a quarter, rounded down, is cut from either end.
-
-    Args:
-        values: `[..., n]`.
-
-    Returns:
-        `[...]`, NaN where a value is.
-    """
-    values = np.asarray(values, np.float64)
-    return np.asarray(scipy.stats.trim_mean(values, 0.25, axis=-1))
-
-
-def stratified_bootstrap(
-    scores: ArrayLike,
-    of: Callable[[Scores], Scores] = interquartile_mean,
-    *,
-    level: float = 0.95,
-    resamples: int = 10_000,
-    seed: int = 0,
-) -> tuple[float, float] | None:
-    """Percentile interval of a value over all seeds and tasks.
-
-    Every task is a stratum: its seeds are drawn anew, with replacement, apart from
-    those of the other tasks.
-
-    Args:
-        scores: `[seeds, tasks]`.
-        of: the value, from `[..., n]` to `[...]`.
-        level: how probable the interval is to hold the value.
-        resamples: how often all is drawn.
-        seed: of the drawing: the same scores always give the same interval.
-
-    Returns:
-        Its two ends; None for fewer than two seeds, which say nothing of the spread.
-    """
-    scores = np.asarray(scores, np.float64)
-    if len(scores) < 2:
-        return None
-
-    def statistic(*tasks: Scores, axis: int) -> Scores:
-        # scipy resamples along the last axis, whatever stands before it.
-        return of(np.concatenate(tasks, axis=axis))
-
-    interval = scipy.stats.bootstrap(
-        tuple(scores.T),
-        statistic,
-        vectorized=True,
-        n_resamples=resamples,
-        confidence_level=level,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return float(interval.low), float(interval.high)

@@ -2,55 +2,81 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.errors import UserError, writing
 from rewire_jax.storage.json_lines import raw
 
 _BEGIN, _END = b"\n<!-- digests of this report's files: ", b" -->\n"
 
 
-def sign(page: Path) -> None:
-    """Adds the digests of all files in its folder, itself included, to a page."""
-    digests = {path.name: _digest(path.read_bytes()) for path in page.parent.iterdir()}
-    with page.open("ab") as file:
-        file.write(_BEGIN + json.dumps(digests, sort_keys=True).encode() + _END)
-
-
-def replace(page: Path, others: Sequence[Path], new: Path) -> None:
-    """Moves new files to the places of a page and of its other files.
+@contextmanager
+def replacing(page: Path, others: Sequence[Path]) -> Iterator[Path]:
+    """A new folder for files, which at the end of the block replace those there.
 
     Args:
-      page: the page; a signed one may be there.
-      others: the other files; the page is replaced after them.
-      new: folder of the new files, of the same names.
+      page: the page, in a folder that is made where missing.
+      others: the other files, in the same folder.
 
     Raises:
-      UserError: a file that is there was not written with the page there, or was
-        changed since. Nothing is moved.
+      UserError: the folder cannot be written, or a file that is there was not written
+        with the page there, or was changed since. Nothing is replaced then.
     """
+    with writing(page.parent):
+        page.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=page.parent, prefix=".report-") as made:
+            new = Path(made)
+            yield new
+            held = _check(page, others, new)
+            _sign(new / page.name, held)
+            # The page knows old and new files. It comes first, so that the next report
+            # replaces one that was killed between two files.
+            for path in (page, *others):
+                (new / path.name).replace(path)
+
+
+def _check(page: Path, others: Sequence[Path], new: Path) -> dict[str, str]:
+    """Digests of the other files that are there; `UserError` if a file is not ours."""
     text, told = _read(page)
+    found = {}
     for path in (page, *others):
         if path.exists() or path.is_symlink():
             held = raw(path)
-            ours = told.get(path.name) == _digest(text if path == page else held)
+            found[path.name] = _digest(text if path == page else held)
+            ours = found[path.name] in told.get(path.name, ())
             if not ours and held != (new / path.name).read_bytes():
                 raise UserError(
                     f"{path} was not written by `report`, or was changed since: move "
                     "it away, or name another --out"
                 )
-    for path in (*others, page):
-        (new / path.name).replace(path)
+    found.pop(page.name, None)
+    return found
 
 
-def _read(page: Path) -> tuple[bytes, dict[str, str]]:
+def _sign(page: Path, held: dict[str, str]) -> None:
+    """Adds digests to a page: of all files in its folder, and of those they replace."""
+    digests = {}
+    for path in page.parent.iterdir():
+        both = _digest(path.read_bytes()), held.get(path.name)
+        digests[path.name] = list(dict.fromkeys(filter(None, both)))
+    with page.open("ab") as file:
+        file.write(_BEGIN + json.dumps(digests, sort_keys=True).encode() + _END)
+
+
+def _read(page: Path) -> tuple[bytes, dict[str, list[str]]]:
     """The text of a page without its comment, and the digests in it."""
     text, _, comment = (raw(page) if page.exists() else b"").rpartition(_BEGIN)
     try:
         told = json.loads(comment.removesuffix(_END))
-        return text, told if isinstance(told, dict) else {}
-    except ValueError:
+        # Older versions had one digest of each file.
+        return text, {
+            name: [each] if isinstance(each, str) else list(each)
+            for name, each in told.items()
+        }
+    except (ValueError, TypeError, AttributeError):
         return text, {}
 
 

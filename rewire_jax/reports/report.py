@@ -4,13 +4,11 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Generic, TypeVar
 
 from rich.console import Console
 from rich.text import Text
 
-from rewire_jax.core.errors import writing
 from rewire_jax.reports import own_files
 from rewire_jax.reports.table import Table, to_markdown, to_rich
 
@@ -69,16 +67,11 @@ class Report(Generic[Numbers]):
             UserError: the folder cannot be written, or has a file of such a name that
                 is of no report.
         """
-        with writing(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with TemporaryDirectory(dir=self.folder, prefix=".report-") as made:
-                new = Path(made)
-                for name, text in {self.name: self._markdown(), **self.texts}.items():
-                    (new / name).write_text(text, encoding="utf-8")
-                self.draw(new)
-                own_files.sign(new / self.name)
-                page, *others = self.paths
-                own_files.replace(page, others, new)
+        page, *others = self.paths
+        with own_files.replacing(page, others) as new:
+            for name, text in {self.name: self._markdown(), **self.texts}.items():
+                (new / name).write_text(text, encoding="utf-8")
+            self.draw(new)
 
     def _markdown(self) -> str:
         notes = (f"**{note}**" for note in self.notes)

@@ -29,7 +29,8 @@ _READING = (
 _NORMALISED = (
     "÷ SAC-N: performance, IQM, forgetting and transfer are divided by the mean return "
     "of SAC-N at the end, averaged over tasks and seeds. Forward transfer is the score "
-    "right after own training minus that of SAC-N."
+    "right after own training minus that of SAC-N. The interval includes the spread of "
+    "SAC-N: its seeds are drawn anew, too."
 )
 _CONTINUAL_WORLD = (
     "Performance and forgetting are Continual World's, whose forgetting has the other "

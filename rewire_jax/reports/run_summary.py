@@ -3,14 +3,16 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.reports import metrics, paper_results
+from rewire_jax.reports import metrics, paper_results, statistics
 from rewire_jax.reports.paper_results import Figures, Source
 from rewire_jax.reports.spread import Interval, Spread, spread
+from rewire_jax.reports.statistics import estimate
 from rewire_jax.storage.run_results import RunData
 from rewire_jax.storage.scores import Score
 
@@ -52,7 +54,7 @@ class Summary:
         performance: score after the last finished stage, averaged over the tasks
             trained by then.
         iqm: interquartile mean of these scores over seeds and tasks, with its
-            stratified bootstrap interval.
+            stratified bootstrap interval; SAC-N's seeds are drawn anew in it, too.
         forgetting: averaged over those tasks.
         transfer: forward transfer averaged over those tasks, where SAC-N normalises or
             single-task runs are given.
@@ -79,6 +81,7 @@ class Comparison:
         summaries: one for each run.
         score: what all of them are measured by.
         sources: where `Summary.published` is from.
+        base: the SAC-N run that normalises; None if scores are raw.
         raw: why scores are raw returns; None where SAC-N normalises them, and for
             scores that are not to be normalised.
         single: what learned one of the tasks alone, that forward transfer is measured
@@ -88,13 +91,14 @@ class Comparison:
     summaries: tuple[Summary, ...]
     score: Score
     sources: tuple[Source, ...]
+    base: RunData | None
     raw: str | None
     single: tuple[RunData, ...]
 
     @property
     def normalised(self) -> bool:
         """Whether scores are multiples of SAC-N's."""
-        return self.score.normalised and self.raw is None
+        return self.base is not None
 
     @property
     def unit(self) -> str:
@@ -112,12 +116,24 @@ class Comparison:
         return MEASURES | ({"transfer": "forward transfer"} if self.single else {})
 
 
-def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Comparison:
+def comparable(run: RunData) -> tuple[Any, ...]:
+    """What is equal in runs that share a table."""
+    settings = (run.settings.get(name, old) for name, old in _SHARED.items())
+    return (*settings, run.score.noun, run.tasks)
+
+
+def summarize(
+    runs: Sequence[RunData],
+    single: Sequence[RunData] = (),
+    names: Sequence[str] | None = None,
+) -> Comparison:
     """Summarizes comparable runs.
 
     Args:
         runs: one or more, complete or partial.
         single: finished runs of one task each, from which forward transfer is measured.
+        names: of the runs' configurations, all different: they label the runs, and the
+            paper's result of a method is that of the configuration of its name.
 
     Raises:
         UserError: there is no run, one is given twice, they are not comparable, or a
@@ -137,15 +153,12 @@ def summarize(runs: Sequence[RunData], single: Sequence[RunData] = ()) -> Compar
     sources = paper_results.sources(
         first.settings["scenario"], first.settings["backend"]
     )
-    methods = Counter(run.settings["method"] for run in runs)
+    labels = _labels(runs) if names is None else list(map(_shown, names))
     summaries = []
-    for run, label in zip(runs, _labels(runs), strict=True):
-        method = run.settings["method"]
-        # The paper has one result a method: it belongs to none of several variants.
-        alone = methods[method] == 1
-        theirs = tuple(s.results.get(method) if alone else None for s in sources)
+    for run, label, name in zip(runs, labels, names or _methods(runs), strict=True):
+        theirs = tuple(source.results.get(name) for source in sources)
         summaries.append(_summary(run, label, base, areas, theirs))
-    return Comparison(tuple(summaries), first.score, sources, raw, tuple(single))
+    return Comparison(tuple(summaries), first.score, sources, base, raw, tuple(single))
 
 
 def _check(run: RunData, other: RunData, *names: str) -> None:
@@ -222,13 +235,14 @@ def _summary(
     theirs: tuple[Figures | None, ...],
 ) -> Summary:
     performance = forgetting = transfer = np.zeros(0)
-    ends = np.zeros((0, 0))
+    iqm = Interval(None, None, None)
     own: dict[str, Array] = {}
     if areas:
         alone = [areas[name] for name in run.tasks[: run.finished]]
         own["transfer"] = metrics.area_transfer(_areas(run, run.finished), alone)
     if run.finished:
         matrix = _matrix(run, run.finished)
+        iqm = _iqm(run, base)
         if base:
             # SAC-N as it was after as many tasks, the mean over its seeds.
             other = _matrix(base, run.finished).mean(axis=0)
@@ -240,7 +254,6 @@ def _summary(
             transfer = own["transfer"].mean(axis=-1)
         performance = metrics.performance(matrix)
         forgetting = metrics.forgetting(matrix).mean(axis=-1)
-        ends = metrics.final(matrix)
     others = [each for each in run.measured if each != run.score]
     return Summary(
         label=label,
@@ -248,7 +261,7 @@ def _summary(
         tasks=_tasks(run, run.score, own),
         others={score.name: _tasks(run, score, {}) for score in others},
         performance=spread(performance),
-        iqm=_iqm(ends),
+        iqm=iqm,
         forgetting=spread(forgetting),
         transfer=spread(transfer),
         published=theirs,
@@ -275,13 +288,41 @@ def _tasks(run: RunData, score: Score, own: dict[str, Array]) -> Tasks:
     )
 
 
-def _iqm(scores: Array) -> Interval:
-    """Interquartile mean of `[seeds, tasks]`; a seed with NaN is passed over."""
-    there = scores[~np.isnan(scores).any(axis=1)]
-    if not there.size:
-        return Interval(None, None, None)
-    value = float(metrics.interquartile_mean(there.ravel()))
-    return Interval(value, *(metrics.stratified_bootstrap(there) or (None, None)))
+def final_samples(run: RunData, base: RunData | None) -> tuple[Array, ...]:
+    """What statistics of a run are estimated from.
+
+    Returns:
+        Scores after the last finished stage, `[seeds, tasks]`, and those of SAC-N after
+        as many, where it divides them. For SAC-N itself both are the same array.
+        Diverged seeds and those with NaN are left out.
+    """
+    scores = _final(run, run.finished)
+    if base is None:
+        return (scores,)
+    return scores, scores if run is base else _final(base, run.finished)
+
+
+def _final(run: RunData, done: int) -> Array:
+    scores = metrics.final(_matrix(run, done))
+    return scores[~np.isnan(scores).any(axis=1)]
+
+
+def _iqm(run: RunData, base: RunData | None) -> Interval:
+    of = statistics.normalised_iqm if base else statistics.interquartile_mean
+    return estimate(of, *final_samples(run, base))
+
+
+def _methods(runs: Sequence[RunData]) -> list[str]:
+    """The runs' methods, empty where several runs share one.
+
+    The paper has one result a method: it belongs to none of several variants.
+    """
+    methods = [str(run.settings["method"]) for run in runs]
+    return [method if methods.count(method) == 1 else "" for method in methods]
+
+
+def _shown(name: str) -> str:
+    return paper_results.NAMES.get(name, name)
 
 
 def _labels(runs: Sequence[RunData]) -> list[str]:
@@ -290,8 +331,7 @@ def _labels(runs: Sequence[RunData]) -> list[str]:
     folder, times = folders.most_common(1)[0]
     if times > 1:
         raise UserError(f"{folder} is given twice")
-    methods = [str(run.settings["method"]) for run in runs]
-    methods = [paper_results.NAMES.get(method, method) for method in methods]
+    methods = [_shown(str(run.settings["method"])) for run in runs]
     names = [f"{m}: {r.folder.name}" for m, r in zip(methods, runs, strict=True)]
     paths = [f"{m}: {r.folder}" for m, r in zip(methods, runs, strict=True)]
     labels = []

@@ -6,6 +6,7 @@ import numpy as np
 
 from rewire_jax.reports import metrics
 from rewire_jax.reports.spread import Interval, Spread, spread
+from rewire_jax.reports.statistics import estimate, mean
 from rewire_jax.run.ranking import rank
 from rewire_jax.storage.result_files import Array
 from rewire_jax.storage.sweep_results import SweepData
@@ -145,8 +146,6 @@ def _configuration(
     lost &= came > 0
     there = members[~lost] if came else members[:0]
     returns = reported[there, last]
-    mean = float(returns.mean()) if returns.size else None
-    ends = metrics.stratified_bootstrap(returns[:, None], _mean)
     return Configuration(
         index=int(sweep.configurations[members[0]]),
         values={name: float(axis[members[0]]) for name, axis in sweep.axes.items()},
@@ -156,13 +155,9 @@ def _configuration(
         kept=tuple(sweep.seeds[there].tolist()),
         diverged=tuple(sweep.seeds[members[lost]].tolist()),
         performance=spread(returns),
-        interval=Interval(mean, *(ends or (None, None))),
+        interval=estimate(mean, returns[:, None]),
         choice=spread(chosen[there, last]),
     )
-
-
-def _mean(values: Array) -> Array:
-    return np.asarray(values.mean(axis=-1))
 
 
 def _panel(order: list[Configuration], axis: str, drawn: bool) -> Panel:

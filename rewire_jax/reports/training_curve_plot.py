@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import EngFormatter, StrMethodFormatter
 
-from rewire_jax.reports.metrics import stratified_bootstrap
+from rewire_jax.reports import statistics
 from rewire_jax.reports.plots import Array, empty, entitle, look
 
 _READING = (
@@ -48,12 +48,9 @@ class Curve(NamedTuple):
         ends = np.full((2, self.x.size), np.nan)
         for i, point in enumerate(self.values.T):
             if len(point) > 1 and not np.isnan(point).any():
-                ends[:, i] = stratified_bootstrap(point[:, None], _mean)
+                mean = statistics.mean
+                ends[:, i] = statistics.stratified_bootstrap(mean, point[:, None])
         return ends
-
-
-def _mean(values: Array) -> Array:
-    return np.mean(values, axis=-1)
 
 
 def evolution(

@@ -14,6 +14,7 @@ from rewire_jax.storage.result_files import (
     Array,
     Flags,
     Results,
+    Rows,
     check_member,
     check_tables,
     read_evaluations,
@@ -92,13 +93,8 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     Raises:
         UserError: a file is missing, or damaged elsewhere than in its last line.
     """
-    head = read_header(Path(folder), "run")
-    folder, tasks = head.folder, len(head.tasks)
-    check_tables(folder)
-    path, members = folder / "results.jsonl", _members(head)
-    rows = read_evaluations(path, head.tasks, members, range(-1, tasks))
-    if not rows:
-        raise UserError(f"{path} holds no results yet")
+    head, rows = read_rows(folder)
+    folder, tasks, members = head.folder, len(head.tasks), _members(head)
     found = sorted({member for member, _, _ in rows})
     seeds = [members[member] for member in found]
     values = to_arrays(rows, found, tasks)
@@ -125,6 +121,21 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
         curve=tuple((x, values * steps) for x, values in trained),
         **timing._asdict(),
     )
+
+
+def read_rows(folder: str | Path) -> tuple[Results, Rows]:
+    """The header and the evaluations of a run, as they are in its folder.
+
+    Raises:
+        UserError: as `read_run`.
+    """
+    head = read_header(Path(folder), "run")
+    check_tables(head.folder)
+    path, stages = head.folder / "results.jsonl", range(-1, len(head.tasks))
+    rows = read_evaluations(path, head.tasks, _members(head), stages)
+    if not rows:
+        raise UserError(f"{path} holds no results yet")
+    return head, rows
 
 
 def read_progress(run: RunData, name: str) -> tuple[tuple[Array, Array], ...]:

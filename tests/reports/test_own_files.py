@@ -108,6 +108,39 @@ def test_a_report_that_cannot_be_finished_leaves_the_older_one(tmp_path: Path) -
     assert held(tmp_path) == before
 
 
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_a_report_that_was_killed_between_two_files_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moved: int
+) -> None:
+    report(tmp_path, 1).write()
+    left, move = [None] * moved, Path.replace
+
+    def kill(path: Path, target: Path) -> Path:
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return move(path, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", kill)
+        with pytest.raises(KeyboardInterrupt):
+            report(tmp_path, 2).write()
+    report(tmp_path, 3).write()
+    assert held(tmp_path)["a.csv"] == b"a\n3\n"
+    # An edited file is still not replaced.
+    draw_another(tmp_path)
+    with pytest.raises(UserError):
+        report(tmp_path, 4).write()
+
+
+def test_a_report_of_an_older_version_is_replaced(tmp_path: Path) -> None:
+    report(tmp_path, 1).write()
+    page = tmp_path / "report.md"
+    page.write_text(page.read_text().replace('["', '"').replace('"]', '"'))
+    report(tmp_path, 2).write()
+    assert held(tmp_path)["a.csv"] == b"a\n2\n"
+
+
 def test_a_run_s_report_is_written_again_over_itself(tmp_path: Path) -> None:
     from rewire_jax.reports.write import write_report
 

@@ -1,0 +1,159 @@
+"""A section of a campaign's page: runs of a scenario that can be compared."""
+
+import base64
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from rewire_jax.reports import run_report, statistics
+from rewire_jax.reports.campaign_data import CampaignData
+from rewire_jax.reports.report import Report
+from rewire_jax.reports.run_summary import (
+    Comparison,
+    comparable,
+    final_samples,
+    summarize,
+)
+from rewire_jax.reports.spread import Interval
+from rewire_jax.reports.statistics import Array, estimate, stratified_bootstrap
+from rewire_jax.reports.titles import several
+from rewire_jax.storage.merged_results import merged
+from rewire_jax.storage.run_results import RunData
+
+_THRESHOLDS = 101
+
+
+@dataclass(frozen=True)
+class Section:
+    """Comparable configurations, of which at least one seed is finished.
+
+    Attributes:
+        report: tables and pictures, as the report of runs has them.
+        unfinished: a sentence for each configuration that lacks seeds.
+        improvement: for each pair of configurations the probability that the first one
+            is better; None for a configuration with itself, or without scores.
+    """
+
+    report: Report[Comparison]
+    unfinished: tuple[str, ...]
+    improvement: tuple[tuple[Interval | None, ...], ...]
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the configurations, in the order of the tables."""
+        return [summary.label for summary in self.report.numbers.summaries]
+
+    def pictures(self) -> list[tuple[str, str]]:
+        """Title and data URI of each picture."""
+        import matplotlib
+
+        titles = {"profiles.png": "Performance profiles", **self.report.pictures}
+        with (
+            TemporaryDirectory() as made,
+            # A name with dollars is no formula.
+            matplotlib.rc_context({"text.parse_math": False}),
+        ):
+            folder = Path(made)
+            self.report.draw(folder)
+            _draw_profiles(self.report, folder / "profiles.png")
+            return [
+                (title, _uri(folder / name))
+                for name, title in titles.items()
+                if (folder / name).exists()
+            ]
+
+
+def _uri(picture: Path) -> str:
+    text = base64.b64encode(picture.read_bytes()).decode()
+    return f"data:image/png;base64,{text}"
+
+
+def sections(data: CampaignData) -> list[Section]:
+    """The sections of a campaign, in the order of its file.
+
+    The seeds of a configuration count as one run, whether they were trained together or
+    not.
+    """
+    runs: dict[tuple[str, str], list[RunData]] = defaultdict(list)
+    for job in data.jobs:
+        if job.run.name in data.finished:
+            key = job.run.settings.scenario, job.run.configuration
+            runs[key].append(data.finished[job.run.name])
+    planned = Counter(
+        (run.settings.scenario, run.configuration) for run in data.campaign.runs
+    )
+    groups: dict[tuple[object, ...], dict[str, RunData]] = defaultdict(dict)
+    for scenario, name in planned:
+        if (scenario, name) in runs:
+            run = merged(runs[scenario, name])
+            groups[comparable(run)][name] = run
+    return [_section(group, planned) for group in groups.values()]
+
+
+def _section(group: dict[str, RunData], planned: Counter[tuple[str, str]]) -> Section:
+    """The section of runs by configuration; `planned` are numbers of seeds."""
+    comparison = summarize([*group.values()], names=[*group])
+    first = comparison.summaries[0].run
+    scenario, unfinished = str(first.settings["scenario"]), []
+    for name, summary in zip(group, comparison.summaries, strict=True):
+        done, count = len(summary.run.seeds), planned[scenario, name]
+        if done < count:
+            said = f"{done} of {several(count, 'seed')}"
+            unfinished.append(f"{summary.label}: only {said} finished.")
+    scores = [final_samples(s.run, None)[0] for s in comparison.summaries]
+    count = len(scores)
+    pairs: list[list[Interval | None]] = [[None] * count for _ in range(count)]
+    for i in range(count):
+        for j in range(i):
+            if scores[i].size and scores[j].size:
+                of = statistics.probability_of_improvement
+                pairs[i][j] = estimate(of, scores[i], scores[j])
+                pairs[j][i] = _complement(pairs[i][j])
+    return Section(
+        report=run_report.make(comparison, first.folder.parent),
+        unfinished=tuple(unfinished),
+        improvement=tuple(map(tuple, pairs)),
+    )
+
+
+def _complement(probability: Interval | None) -> Interval | None:
+    """The probability of the contrary."""
+    if probability is None or probability.value is None:
+        return None
+    low, high = (
+        None if end is None else 1 - end for end in (probability.high, probability.low)
+    )
+    return Interval(1 - probability.value, low, high)
+
+
+def _draw_profiles(report: Report[Comparison], path: Path) -> None:
+    # Here, because Matplotlib takes long to import.
+    from rewire_jax.reports.profile_plot import Profile, profiles
+
+    comparison = report.numbers
+    scores = [final_samples(s.run, comparison.base) for s in comparison.summaries]
+    values = np.concatenate([_ratio(*each).ravel() for each in scores])
+    if not values.size:
+        return
+    low, high = comparison.score.limits or (values.min(), values.max())
+    thresholds = np.linspace(low, high if high > low else low + 1, _THRESHOLDS)
+
+    def shares(*samples: Array) -> Array:
+        return statistics.performance_profile(_ratio(*samples), thresholds)
+
+    lines = [
+        Profile(summary.label, shares(*samples), stratified_bootstrap(shares, *samples))
+        for summary, samples in zip(comparison.summaries, scores, strict=True)
+        if samples[0].size
+    ]
+    profiles(lines, thresholds, comparison.unit, report.title, path)
+
+
+def _ratio(scores: Array, divisor: Array | None = None) -> Array:
+    """Scores over the mean of a divisor, both `[..., seeds, tasks]`."""
+    if divisor is None:
+        return scores
+    return scores / statistics.mean(divisor)[..., None, None]
