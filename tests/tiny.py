@@ -29,7 +29,7 @@ def small(settings: Settings) -> Settings:
         selection_episodes=2,
         report_every=160,
         checkpoint_every=320,
-        sac=dataclasses.replace(settings.sac, hidden=16, batch_size=32),
+        sac=dataclasses.replace(settings.sac, hidden=16, depth=2, batch_size=32),
     )
 
 
@@ -65,5 +65,6 @@ def flags(settings: Settings) -> list[str]:
         "checkpoint_every",
     )
     values = {name: getattr(settings, name) for name in names}
-    values |= {name: getattr(settings.sac, name) for name in ("hidden", "batch_size")}
+    sizes = ("hidden", "depth", "batch_size")
+    values |= {name: getattr(settings.sac, name) for name in sizes}
     return [w for n, v in values.items() for w in ("--" + n.replace("_", "-"), str(v))]

@@ -220,12 +220,6 @@ def _actor(learner: TrainState) -> _Actor:
     )
 
 
-def no_metrics(update: Callable[..., tuple[Any, Metrics]], *arguments: Any) -> Metrics:
-    """Returns zeros with the shapes of the metrics that `update` returns second."""
-    _, shapes = jax.eval_shape(update, *arguments)
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-
 def first_metrics(
     learner: TrainState,
     batch: Batch,
@@ -234,10 +228,13 @@ def first_metrics(
     sac: SacSettings,
 ) -> Metrics:
     """Returns the metrics for the first `update` of a round: zeros."""
-    policy = no_metrics(
-        lambda: _update_policy(_actor(learner), learner, batch, draw, method, sac)
+    # The loss alone, without its gradient, is traced quickly.
+    _, shapes = jax.eval_shape(
+        lambda: _policy_loss(learner.params, learner, batch, draw, method, sac)
     )
-    return {"critic_loss": jnp.zeros(()), "q": jnp.zeros(()), **policy}
+    metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    names = ("critic_loss", "q", "temperature")
+    return metrics | {name: jnp.zeros(()) for name in names}
 
 
 def _every(delay, count, change, keep, value):

@@ -179,6 +179,30 @@ def store(
     )
 
 
+def no_metrics(
+    state: RunnerState,
+    environment: Environment | HostEnvironment,
+    method: Method,
+    settings: SacSettings,
+) -> sac.Metrics:
+    """Returns zeros with the shapes of the metrics of an update."""
+    learner, buffer = state.learner, state.collection.buffer
+    size = settings.batch_size, environment.action_size
+
+    def first():
+        key = jax.random.key(0)
+        batch = replay_buffer.sample(
+            buffer, key, jnp.asarray(1), size[0], environment.episode_length
+        )
+        draw = sac.sample_noise(
+            key, learner.method_state, batch.extras, size, method, settings
+        )
+        return sac.first_metrics(learner, batch, draw, method, settings)
+
+    shapes = jax.eval_shape(first)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
 def update_from_buffer(
     key: jax.Array,
     state: RunnerState,
@@ -234,7 +258,7 @@ def update_from_buffer(
         0,
         jnp.asarray(due, jnp.int32),
         lambda _, carry: learned(carry[0]),
-        (state.learner, sac.no_metrics(learned, state.learner)),
+        (state.learner, no_metrics(state, environment, method, settings)),
     )
     active = state.active & all_finite(
         (learner.params, learner.critic, learner.log_temperature)
@@ -321,7 +345,7 @@ def run_chunk(
         none,
         none,
         none,
-        sac.no_metrics(update, key, state, time),
+        no_metrics(state, environment, method, settings),
         {},
         rollout.Success(jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
         if environment.success

@@ -26,6 +26,7 @@ TINY = {
     "--eval-episodes": 2,
     "--report-every": 160,
     "--checkpoint-every": 0,
+    "--depth": 1,
     "--hidden": 8,
     "--batch-size": 8,
 }

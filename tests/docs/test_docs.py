@@ -103,7 +103,8 @@ def test_drawings_are_the_same_each_time(tmp_path: Path) -> None:
 
 
 def test_the_files_of_a_run_are_told(site, tmp_path: Path) -> None:
-    folder = rewire_jax.train(dataclasses.replace(tiny(), seeds=1), tmp_path / "run")
+    settings = dataclasses.replace(tiny(), seeds=1, tasks=1, interactions=320)
+    folder = rewire_jax.train(settings, tmp_path / "run")
     known = codes(site["files"])
     files = {path.name for path in folder.iterdir()}
     assert {name.replace("checkpoints", "checkpoints/") for name in files} <= known

@@ -11,6 +11,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +24,7 @@ from rewire_jax.cli import main
 from rewire_jax.storage.run_folder import TABLES
 from tests.tiny import flags, tiny
 
-SETTINGS = tiny(method="ft1")
+SETTINGS = replace(tiny(method="ft1"), tasks=2)
 RUN = ["train", "probe/reach", *flags(SETTINGS), "--out"]
 
 

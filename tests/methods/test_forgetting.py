@@ -29,7 +29,7 @@ SCENARIO = make_scenario(ScenarioSpec("probe/corners", "reach", CHANGES, 1, 6400
 SEEDS = 3
 PULLED = ("ft_l2", "ewc")
 KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp")
-QUICK = ("ft1", "csp", "rewire")
+QUICK = ("ft1", "rewire")
 # Where the quick profile's values do not fit networks and budgets this small.
 OPTIONS: dict[str, dict] = {
     # At 1 the Fisher information of so few weights, so little trained, holds nothing.
@@ -184,6 +184,7 @@ def test_one_trace_for_all_tasks(
     assert counts["episodes"] <= num_plays(method)
 
 
+@pytest.mark.slow
 def test_csp_plays_what_its_search_found(trained: Callable[[str], Trained]) -> None:
     prepared = run_setup.prepare(settings("csp"), SCENARIO)
     learner = jax.eval_shape(prepared.program.init, prepared.stacked)
@@ -216,14 +217,8 @@ def short(method: str, seed: int, seeds: int):
     return learner, reports, program.policies(members, learner)
 
 
-# Each compiles anew for a member alone; CSP has the most that could depend on others.
-@pytest.mark.parametrize(
-    "method",
-    [
-        method if method == "csp" else pytest.param(method, marks=pytest.mark.slow)
-        for method in METHODS
-    ],
-)
+@pytest.mark.slow  # each compiles anew for a member alone
+@pytest.mark.parametrize("method", METHODS)
 def test_a_member_is_the_same_alone(method: str) -> None:
     together, alone = short(method, 0, SEEDS), short(method, 1, 1)
     for whole, one in zip(

@@ -308,6 +308,13 @@ def test_policies_that_share_play_as_each_alone():
     together = program.rollout(
         tasks, program.policies(members, learner), keys, 2
     ).returns
+
+    @jax.jit
+    def alone(tasks, policies, keys):
+        environment = plan.scenario.environment
+        act = pnn_of(plan).act
+        return rollout.episodes(environment, act, tasks, policies, keys, 2).returns
+
     for place, row in itertools.product(range(plan.num_slots), range(len(plan.names))):
         mine = jax.tree.map(
             lambda x, p=place: x[p], (learner.params, learner.method_state)
@@ -315,15 +322,12 @@ def test_policies_that_share_play_as_each_alone():
         policy = pnn_of(plan).policy(*mine, jnp.asarray(row))
         stacked = jax.tree.map(lambda x: x[None], policy)
         stacked = map_own(lambda x: x[None], stacked)
-        alone = rollout.episodes(
-            plan.scenario.environment,
-            pnn_of(plan).act,
+        returns = alone(
             jax.tree.map(lambda x, r=row: x[r : r + 1], tasks),
             stacked,
             keys[place : place + 1, row : row + 1],
-            2,
         )
-        np.testing.assert_allclose(alone.returns[0, 0], together[place, row], rtol=1e-4)
+        np.testing.assert_allclose(returns[0, 0], together[place, row], rtol=1e-4)
     assert len(set(np.asarray(together).ravel().tolist())) > plan.num_slots
 
 

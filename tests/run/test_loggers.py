@@ -145,8 +145,8 @@ def killing(monkeypatch: pytest.MonkeyPatch, name: str, times: int) -> None:
 @pytest.mark.parametrize(
     ("method", "name", "times"),
     [
-        ("rewire", "chunk", 7),
-        ("rewire", "evaluate", 3),
+        ("ft1", "chunk", 7),
+        ("ft1", "evaluate", 3),
         ("packnet", "offline_update", 2),
     ],
 )

@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 import json
 import os
 import re
@@ -6,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,7 +54,7 @@ def small(**changes) -> Settings:
         checkpoint_every=160,
         eval_episodes=2,
     )
-    sac = dataclasses.replace(settings.sac, hidden=14, batch_size=16)
+    sac = dataclasses.replace(settings.sac, hidden=14, depth=1, batch_size=16)
     return dataclasses.replace(settings, sac=sac, **changes)
 
 
@@ -189,6 +191,7 @@ def kept(folder: Path) -> list[np.ndarray]:
     return leaves
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_resumes_bit_for_bit(swept: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     process = subprocess.Popen(command(folder), stderr=subprocess.PIPE)
@@ -274,6 +277,7 @@ def test_two_processes_share_the_batches(swept: Path, tmp_path: Path) -> None:
     near(rows(folder), rows(swept))
 
 
+@pytest.mark.slow
 def test_who_joins_finishes_what_another_process_left(
     swept: Path, tmp_path: Path
 ) -> None:
@@ -303,16 +307,67 @@ def run_sweep(folder: Path, settings: Settings, **options) -> Path:
     return sweep.sweep(settings, folder, **options)
 
 
-@pytest.mark.slow
-def test_one_trace_for_all_batches_and_tasks(tmp_path: Path) -> None:
-    # Seven members in slots for eight.
-    sac = dataclasses.replace(small().sac, hidden=15)
-    settings = dataclasses.replace(small(), sac=sac)
-    axis = {"beta": [1, 2, 3, 4, 5, 6, 7]}
+# Seven members in slots for eight. A width of its own, so that traces are counted.
+SEVEN = {"axes": {"beta": [1, 2, 3, 4, 5, 6, 7]}, "members_per_batch": 4}
+
+
+def seven() -> Settings:
+    return dataclasses.replace(small(), sac=dataclasses.replace(small().sac, hidden=15))
+
+
+class Unbroken(NamedTuple):
+    folder: Path
+    compiled: Mapping[str, int]
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Unbroken:
+    """A sweep of seven members, and what it compiled."""
     with compiles() as counts:
-        folder = run_sweep(tmp_path / "s", settings, axes=axis, members_per_batch=4)
-    assert_once(counts, "candidates")
-    assert {place[1] for place in rows(folder)} == set(range(7))
+        folder = run_sweep(tmp_path_factory.mktemp("seven") / "s", seven(), **SEVEN)
+    return Unbroken(folder, counts)
+
+
+def same_tables(folder: Path, other: Path) -> None:
+    paths = [p for p in other.glob("task-*/batch-*/*.jsonl") if p.stem != "timing"]
+    assert len(paths) == 2 * 2 * 2
+    for path in paths:
+        assert (folder / path.relative_to(other)).read_bytes() == path.read_bytes()
+
+
+def test_one_trace_for_all_batches_and_tasks(unbroken: Unbroken) -> None:
+    assert_once(unbroken.compiled, "candidates")
+    assert {place[1] for place in rows(unbroken.folder)} == set(range(7))
+
+
+class Killed(BaseException):
+    pass
+
+
+# Each batch of a task is a chunk to each of four reports, with a checkpoint after two.
+@pytest.mark.parametrize(("how", "chunks"), [("resume", 11), ("join", 3)])
+def test_a_broken_sweep_is_finished_bit_for_bit(
+    how: str,
+    chunks: int,
+    unbroken: Unbroken,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chunk, made = train_run.Run.chunk, itertools.count()
+
+    def killed(self, *rest):
+        if next(made) == chunks:
+            raise Killed
+        return chunk(self, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train_run.Run, "chunk", killed)
+        with pytest.raises(Killed):
+            run_sweep(tmp_path / "sweep", seven(), **SEVEN)
+    (last,) = (tmp_path / "sweep").glob("task-*/batch-*/checkpoints/*-step-*")
+    run_sweep(tmp_path / "sweep", seven(), **SEVEN, **{how: True})
+    assert not last.exists()
+    same_tables(tmp_path / "sweep", unbroken.folder)
 
 
 @pytest.mark.slow
@@ -412,7 +467,7 @@ def test_random_and_halved_from_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # K is kept; of four configurations two and one go on.
-    words = command(tmp_path / "sweep")[3:]
+    words = command(tmp_path / "sweep", most=2)[3:]
     words = [*words[: words.index("--k")], "--k", "1", "--beta", "0.1", "10"]
     main.main([*words, "--random", "4", "--halving", "2"])
     assert "4 configurations" in " ".join(capsys.readouterr().out.split())
@@ -427,7 +482,7 @@ def test_random_and_halved_from_the_command_line(
 
 @pytest.mark.parametrize("name", ["chunk", "evaluate"])
 def test_a_sweep_stops_when_asked_to(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, unbroken: Unbroken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     called = getattr(train_run.Run, name)
 
@@ -435,17 +490,13 @@ def test_a_sweep_stops_when_asked_to(
         os.kill(os.getpid(), signal.SIGINT)
         return called(self, *rest)
 
-    options = {"axes": {"beta": [1, 2, 3, 4, 5, 6, 7]}, "members_per_batch": 4}
-    settings = dataclasses.replace(
-        small(), sac=dataclasses.replace(small().sac, hidden=15)
-    )
     with monkeypatch.context() as patch:
         patch.setattr(train_run.Run, name, interrupted)
         with pytest.raises(interrupts.Stopped, match="same command with --resume"):
-            run_sweep(tmp_path / "sweep", settings, **options)
+            run_sweep(tmp_path / "sweep", seven(), **SEVEN)
     assert not (tmp_path / "sweep/task-000/batch-001").exists()
-    run_sweep(tmp_path / "sweep", settings, **options, resume=True)
-    assert len(rows(tmp_path / "sweep")) == 3 * 7 * 2
+    run_sweep(tmp_path / "sweep", seven(), **SEVEN, resume=True)
+    same_tables(tmp_path / "sweep", unbroken.folder)
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,7 @@ def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
     assert all(path.exists() for path in report.paths)
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
     words = arguments(tiny(), folder)
@@ -141,7 +142,9 @@ def stop_after(
     ("method", "times", "name", "resumed"),
     [
         ("packnet", 3, "offline_update", "task-001-step-0000040"),
-        ("csp", 5, "chunk", "task-001-step-0000020"),
+        pytest.param(
+            *("csp", 5, "chunk", "task-001-step-0000020"), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_what_a_method_needs_within_a_task_is_saved(
@@ -189,6 +192,9 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     assert capsys.readouterr().err.count("falling back") == min(damaged, len(found))
     for name in TABLES:
         assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes()
+    ours, theirs = (leaves(folder, tiny()) for folder in (tmp_path / "run", run))
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("table", TABLES)

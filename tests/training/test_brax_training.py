@@ -52,7 +52,12 @@ def test_every_scenario_trains_through_all_its_tasks_in_one_program(domain) -> N
         scenario = make_scenario(name)
         settings = preset(scenario, "ft1")
         sac = dataclasses.replace(
-            settings.sac, hidden=8, batch_size=4, policy_delay=1, target_delay=1
+            settings.sac,
+            hidden=8,
+            depth=1,
+            batch_size=4,
+            policy_delay=1,
+            target_delay=1,
         )
         settings = dataclasses.replace(
             settings, seeds=2, interactions=8, envs=2, updates=2, warmup=4, sac=sac

@@ -88,7 +88,13 @@ def equal(one, other):
 
 
 @pytest.mark.parametrize(
-    ("method", "color"), [("ft1", 0.0), ("ft1", 1.0), ("rewire", 0.0), ("csp", 0.0)]
+    ("method", "color"),
+    [
+        ("ft1", 1.0),
+        ("csp", 0.0),
+        pytest.param("ft1", 0.0, marks=pytest.mark.slow),
+        pytest.param("rewire", 0.0, marks=pytest.mark.slow),
+    ],
 )
 def test_the_loop_does_what_the_compiled_one_does(method, color):
     made = settings(method, interactions=400)
@@ -385,7 +391,14 @@ def test_a_killed_run_resumes_in_the_middle_of_an_episode(tmp_path):
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
 
 
-@pytest.mark.parametrize(("method", "overlap"), [("rewire", True), ("csp", False)])
+@pytest.mark.parametrize(
+    ("method", "overlap"),
+    [
+        ("ft1", True),
+        pytest.param("rewire", True, marks=pytest.mark.slow),
+        ("csp", False),
+    ],
+)
 def test_what_is_needed_within_a_task_is_saved(method, overlap, tmp_path, monkeypatch):
     made = settings(method, overlap=overlap, interactions=240, checkpoint_every=100)
     scenario = walk.scenario(walk.walker(0.5))

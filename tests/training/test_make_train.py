@@ -17,6 +17,8 @@ from tests.tiny import tiny
 def small(method: str = "rewire") -> rewire_jax.Settings:
     # 640 interactions are no multiple of a report: the last chunk is shorter.
     settings = dataclasses.replace(tiny(method=method), tasks=2, report_every=240)
+    sac = dataclasses.replace(settings.sac, depth=1)
+    settings = dataclasses.replace(settings, sac=sac)
     if method == "csp":
         options = dataclasses.replace(settings.options, samples=16, estimations=4)
         settings = dataclasses.replace(

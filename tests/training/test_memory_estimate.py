@@ -93,13 +93,13 @@ def test_buffer_is_what_a_hand_counts():
 
 
 def test_twice_the_buffer_environments_and_episodes():
-    once = needed(interactions=64_000)
-    assert needed(interactions=128_000).buffer == pytest.approx(
+    once = needed("ft1", interactions=64_000)
+    assert needed("ft1", interactions=128_000).buffer == pytest.approx(
         2 * once.buffer, rel=0.02
     )
-    assert needed(envs=32).environments == 2 * once.environments
+    assert needed("ft1", envs=32).environments == 2 * once.environments
     # Policies are needed whatever the episodes.
-    one, three, five = (needed(eval_episodes=n).evaluation for n in (1, 3, 5))
+    one, three, five = (needed("ft1", eval_episodes=n).evaluation for n in (1, 3, 5))
     assert five - three == three - one > 0
 
 

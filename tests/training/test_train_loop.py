@@ -370,8 +370,8 @@ def test_varied_environments_start_each_episode_from_a_reset_of_its_own():
     length, members = varied.episode_length, crowd()
     states = [go(p, members, begin(p, members), [3 * length])[0] for p in programs]
     fresh, stored = (np.asarray(s.collection.buffer.observation) for s in states)
-    # Up to the first end nothing is different.
-    np.testing.assert_array_equal(fresh[:, :length], stored[:, :length])
+    # Up to the first end nothing is different, but for rounding: the programs differ.
+    np.testing.assert_allclose(fresh[:, :length], stored[:, :length], atol=1e-5)
     # One of each seed: two configurations share these.
     starts = fresh[:2, : 3 * length : length].reshape(-1, 2)
     assert len(np.unique(starts, axis=0)) == len(starts)
