@@ -8,13 +8,12 @@ from experiments import first_task, suite
 from experiments.first_task import FirstTask, Trained
 from rewire_jax.reports.spread import spread
 
-# Two of the runs are Figure 5's.
 VARIANTS: suite.Variants = {
-    "ft1": ("ft1", {}),
+    "ft1-white": ("ft1", {"sac": {"noise_color": 0.0}}),
     "ft1-pink": ("ft1", {"sac": {"noise_color": 1.0}}),
-    "rewire": ("rewire", {}),
+    "rewire-white": ("rewire", {"sac": {"noise_color": 0.0}}),
 }
-LABELS = {"ft1": "FT-1", "ft1-pink": "FT-1, pink noise", "rewire": "Ours"}
+LABELS = {"ft1-white": "FT-1", "ft1-pink": "FT-1, pink noise", "rewire-white": "Ours"}
 
 
 def tell(trained: Trained) -> str:

@@ -1,7 +1,8 @@
 """Which short regime learns to run: FT-1 on the first task, one regime a row.
 
-A regime changes the quick profile: its environments, interactions, updates, and some of
-SAC's settings. The table shows which budget a policy needs to stand up.
+A regime changes `BASE`: its environments, interactions, updates, and some of SAC's
+settings. The table shows which budget a policy needs to stand up. It gave the settings
+of the quick profile.
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,10 @@ from rewire_jax.reports.provenance import origin
 from rewire_jax.storage.run_results import RunData, read_run
 
 SCENARIO = "halfcheetah/forgetting"
+BASE = {"envs": 32, "updates": 16, "interactions": 38_400, "warmup": 2_560}
+BASE |= {"report_every": 2_560, "eval_episodes": 32, "checkpoint_every": 0}
+BASE_SAC = {"batch_size": 256, "reward_scale": 1.0, "discount": 0.99}
+BASE_SAC |= {"target_rate": 0.005, "noise_color": 0.0, "initial_temperature": 0.1}
 AVERAGED = {"critic_entropy": "batch_mean", "policy_states": "both"}
 SCALED = AVERAGED | {"reward_scale": 10.0}
 HALF = {"envs": 64, "interactions": 76_800, "warmup": 5_120, "report_every": 6_400}
@@ -43,18 +48,27 @@ REGIMES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "envs-128-scale-10-policy-delay-1": (MANY, SCALED | {"policy_delay": 1}),
     "envs-128-scale-10-batch-128": (DOUBLE, SCALED | SMALL),
     "envs-32-scale-10-batch-128": (FEW, SCALED | SMALL),
+    "envs-32-scale-10-batch-128-discount-target-rate": (
+        FEW,
+        SCALED | SMALL | QUICK | SLOW,
+    ),
+    "envs-32-scale-10-batch-128-pink-discount-target-rate": (
+        FEW,
+        SCALED | SMALL | QUICK | SLOW | PINK,
+    ),
     "envs-32-batch-128": (FEW, AVERAGED | SMALL),
     "envs-32-scale-3-batch-128": (FEW, AVERAGED | SMALL | {"reward_scale": 3.0}),
 }
-"""Changes of the quick profile's settings, and of SAC's."""
+"""Changes of `BASE`, and of `BASE_SAC`."""
 HEAD = ["regime", "interactions", "updates", "seeds"]
 HEAD += ["training return, each seed", "without exploration, each seed"]
 READING = (
-    "All regimes have a reduced budget (paper: 1,000,000 interactions) and change the "
-    "quick profile. All use `--critic-entropy batch_mean --policy-states both`. In "
-    "their names, envs is `--envs`, scale `--reward-scale`, width `--hidden`, "
-    "temperature `--initial-temperature`, pink `--noise-color 1`, batch "
-    "`--batch-size`. The training return is the mean over the last whole episode."
+    "All regimes have a reduced budget (paper: 1,000,000 interactions). All use "
+    "`--critic-entropy batch_mean --policy-states both`. In their names, envs is "
+    "`--envs`, scale `--reward-scale`, width `--hidden`, temperature "
+    "`--initial-temperature`, pink `--noise-color 1`, discount `--discount 0.97`, "
+    "target-rate `--target-rate 0.02`, batch `--batch-size`. The training return is "
+    "the mean over the last whole episode."
 )
 
 
@@ -85,10 +99,9 @@ class Regimes(suite.Experiment):
         changes, sac = REGIMES[name]
         folder = self.out / "quick-regime" / name / f"seed-{seed}"
         single = replace(self, seed=seed, seeds=1)
-        run = single.run(self.scenario_of(SCENARIO), "ft1", folder, sac)
-        settings = replace(
-            run.settings, eval_episodes=32, checkpoint_every=0, **changes
-        )
+        scenario = self.scenario_of(SCENARIO)
+        run = single.run(scenario, "ft1", folder, BASE_SAC | sac)
+        settings = replace(run.settings, **BASE | changes)
         return run._replace(settings=settings)
 
 

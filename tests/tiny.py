@@ -9,6 +9,16 @@ import rewire_jax
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import Scenario, make_scenario
 
+# SAC's own defaults in place of the quick profile's values, which suit a HalfCheetah.
+PLAIN = {
+    "reward_scale": 1.0,
+    "discount": 0.99,
+    "target_rate": 0.005,
+    "critic_entropy": "sample",
+    "policy_states": "current",
+    "noise_color": 0.0,
+}
+
 
 def tiny(scenario: str | Scenario = "probe/reach", method: str = "rewire") -> Settings:
     if isinstance(scenario, str):
@@ -29,7 +39,9 @@ def small(settings: Settings) -> Settings:
         selection_episodes=2,
         report_every=160,
         checkpoint_every=320,
-        sac=dataclasses.replace(settings.sac, hidden=16, depth=2, batch_size=32),
+        sac=dataclasses.replace(
+            settings.sac, hidden=16, depth=2, batch_size=32, **PLAIN
+        ),
     )
 
 
@@ -65,6 +77,6 @@ def flags(settings: Settings) -> list[str]:
         "checkpoint_every",
     )
     values = {name: getattr(settings, name) for name in names}
-    sizes = ("hidden", "depth", "batch_size")
-    values |= {name: getattr(settings.sac, name) for name in sizes}
+    names = ("hidden", "depth", "batch_size", *PLAIN)
+    values |= {name: getattr(settings.sac, name) for name in names}
     return [w for n, v in values.items() for w in ("--" + n.replace("_", "-"), str(v))]

@@ -279,9 +279,9 @@ def test_pink_noise_differs_in_the_noise_alone(trained, tmp_path):
     assert [settings.seed for _, settings, _ in trained] == [0] * 3 + [1] * 3
     runs = {f.parent.name: settings for f, settings, _ in trained[:3]}
     colors = {name: settings.sac.noise_color for name, settings in runs.items()}
-    assert colors == {"ft1": 0, "ft1-pink": 1, "rewire": 0}
-    sac = dataclasses.replace(runs["ft1"].sac, noise_color=1)
-    assert dataclasses.replace(runs["ft1"], sac=sac) == runs["ft1-pink"]
+    assert colors == {"ft1-white": 0, "ft1-pink": 1, "rewire-white": 0}
+    sac = dataclasses.replace(runs["ft1-white"].sac, noise_color=1)
+    assert dataclasses.replace(runs["ft1-white"], sac=sac) == runs["ft1-pink"]
     assert {settings.tasks for settings in runs.values()} == {1}
     out = tmp_path / "pink-noise-quick-tasks-1"
     # After the first task: FT-1 has half of 1000 and GAP more, the other all of it.

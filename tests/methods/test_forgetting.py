@@ -63,6 +63,9 @@ def settings(method: str) -> Settings:
         checkpoint_every=0,
         sac=dataclasses.replace(
             quick.sac,
+            critic_entropy="sample",
+            policy_states="current",
+            noise_color=0.0,
             # A width of its own, so that no other test has compiled the same.
             hidden=32,
             depth=2,
