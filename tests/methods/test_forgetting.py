@@ -66,6 +66,7 @@ def settings(method: str) -> Settings:
             critic_entropy="sample",
             policy_states="current",
             noise_color=0.0,
+            reward_scale=1.0,
             # A width of its own, so that no other test has compiled the same.
             hidden=32,
             depth=2,
