@@ -10,8 +10,8 @@ from rewire_jax.run.progress import Progress
 from rewire_jax.run.run_state import RunState
 from rewire_jax.storage import run_folder
 from rewire_jax.training import memory_estimate, rollout
+from rewire_jax.training.loop_state import ChunkMetrics
 from rewire_jax.training.run_setup import Plan, base_size
-from rewire_jax.training.train_loop import ChunkMetrics
 
 
 class Recorder:

@@ -20,10 +20,10 @@ from rewire_jax.methods import find_method
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.json_lines import reading
 from rewire_jax.training import population
+from rewire_jax.training.loop_state import RunnerState
 from rewire_jax.training.population import Member
 from rewire_jax.training.run_setup import Plan
 from rewire_jax.training.sac import TrainState
-from rewire_jax.training.train_loop import RunnerState
 
 _FOLDER = "checkpoints"
 

@@ -24,12 +24,12 @@ from rewire_jax.run.recorder import Recorder
 from rewire_jax.run.run_state import RunState
 from rewire_jax.storage import run_folder
 from rewire_jax.training import (
+    loop_state,
     memory_estimate,
     population,
     random_keys,
     rollout,
     selection,
-    train_loop,
 )
 from rewire_jax.training.random_keys import Stream
 from rewire_jax.training.run_setup import Plan, prepare
@@ -205,7 +205,7 @@ class Run:
         return min(every - done % every, end - done)
 
     def advance(
-        self, now: RunState, state: train_loop.RunnerState, steps: int
+        self, now: RunState, state: loop_state.RunnerState, steps: int
     ) -> RunState:
         """Returns the state after these steps; reports members that became inactive."""
         active = np.array(state.active)

@@ -11,8 +11,8 @@ from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Candidates, CandidateScore, Method
 from rewire_jax.training import host_train_loop, population, rollout, sac
+from rewire_jax.training.loop_state import ChunkMetrics, RunnerState
 from rewire_jax.training.member_functions import MemberFunctions
-from rewire_jax.training.train_loop import ChunkMetrics, RunnerState
 
 
 class Program(NamedTuple):

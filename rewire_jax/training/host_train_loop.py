@@ -22,15 +22,16 @@ from rewire_jax.envs.vector_env import open_lanes, shown
 from rewire_jax.training import (
     exploration,
     host_episodes,
+    loop_state,
     population,
     random_keys,
     train_loop,
 )
 from rewire_jax.training.host_rollout import play
+from rewire_jax.training.loop_state import ChunkMetrics, CollectorState, LoopConfig
 from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Members
 from rewire_jax.training.rollout import Rollout, Step
-from rewire_jax.training.train_loop import ChunkMetrics, CollectorState, LoopConfig
 
 Array = NDArray[Any]
 
@@ -38,10 +39,10 @@ Array = NDArray[Any]
 class Loop(NamedTuple):
     """The functions that step environments; see `compiled_functions.Program`."""
 
-    begin: Callable[..., train_loop.RunnerState]
-    chunk: Callable[..., tuple[train_loop.RunnerState, ChunkMetrics]]
+    begin: Callable[..., loop_state.RunnerState]
+    chunk: Callable[..., tuple[loop_state.RunnerState, ChunkMetrics]]
     rollout: Callable[..., Rollout]
-    state_shape: Callable[..., train_loop.RunnerState]
+    state_shape: Callable[..., loop_state.RunnerState]
 
 
 class _Functions(NamedTuple):
@@ -63,7 +64,7 @@ class _Functions(NamedTuple):
     """
 
     roots: Callable[..., jax.Array]
-    begin: Callable[..., train_loop.RunnerState]
+    begin: Callable[..., loop_state.RunnerState]
     draws: Callable[..., exploration.ActionNoise]
     act: Callable[..., tuple[jax.Array, Any]]
     store_and_update: Callable[..., tuple[Any, Any, Any, Any]]
@@ -167,7 +168,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         step_keys = random_keys.of_step(of.keys(member, index).steps, done - 1)
         state, metrics = train_loop.update_from_buffer(
             step_keys.update,
-            train_loop.RunnerState(learner, CollectorState(buffer, (), ()), active),
+            loop_state.RunnerState(learner, CollectorState(buffer, (), ()), active),
             done,
             shape.before(done),
             shape.due(done),
@@ -179,7 +180,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         return state.learner, buffer, state.active, metrics
 
     def inspect(member, learner, buffer, index, time):
-        state = train_loop.RunnerState(
+        state = loop_state.RunnerState(
             learner, CollectorState(buffer, (), ()), jnp.asarray(True)
         )
         key, method = of.keys(member, index).steps, of.method(member)
@@ -215,12 +216,12 @@ def _chunk(
     shape: LoopConfig,
     mesh: Mesh,
     members: Members,
-    state: train_loop.RunnerState,
+    state: loop_state.RunnerState,
     index: int,
     task: Task,
     time: int,
     steps: int,
-) -> tuple[train_loop.RunnerState, ChunkMetrics]:
+) -> tuple[loop_state.RunnerState, ChunkMetrics]:
     """Collects and updates for a chunk, a multiple of `LoopConfig.update_every`."""
     assert steps % shape.update_every == 0
     learner, (buffer, episodes, extras), active, acting = state
@@ -283,7 +284,7 @@ def _chunk(
         inspected=functions.inspect(members, learner, buffer, index, end)
     )
     episodes, extras = population.place((episodes, extras), mesh)
-    return train_loop.RunnerState(
+    return loop_state.RunnerState(
         learner,
         CollectorState(buffer, episodes, extras),
         active,

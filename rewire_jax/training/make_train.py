@@ -18,6 +18,7 @@ from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Selection
 from rewire_jax.training import random_keys, rollout, selection
 from rewire_jax.training.acting import Act, Learned, act_function
+from rewire_jax.training.loop_state import ChunkMetrics
 from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Members
 from rewire_jax.training.random_keys import Stream
@@ -28,7 +29,6 @@ from rewire_jax.training.run_setup import (
     make_functions,
 )
 from rewire_jax.training.sac import TrainState
-from rewire_jax.training.train_loop import ChunkMetrics
 
 
 class Curves(NamedTuple):

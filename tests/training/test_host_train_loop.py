@@ -21,7 +21,7 @@ from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.envs.vector_env import VectorEnv, open_lanes
 from rewire_jax.methods import find_method
 from rewire_jax.run import interrupts, train_run
-from rewire_jax.training import exploration, host_episodes, train_loop
+from rewire_jax.training import exploration, host_episodes, loop_state
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import Plan, prepare
 from tests import walk
@@ -459,7 +459,7 @@ def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():
 
 
 def test_updates_follow_every_so_many_steps():
-    shape = train_loop.LoopConfig(
+    shape = loop_state.LoopConfig(
         1, updates=7, warmup=10, random_steps=0, transitions=9, update_every=4
     )
     due = [steps for steps in range(1, 30) if shape.due(steps)]

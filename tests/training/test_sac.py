@@ -12,7 +12,7 @@ from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec
 from rewire_jax.nn import networks
-from rewire_jax.training import replay_buffer, rollout, sac, train_loop
+from rewire_jax.training import loop_state, replay_buffer, rollout, sac, train_loop
 
 SPEC = Spec(observations=3, actions=2, hidden=4, depth=2, tasks=1)
 SETTINGS = SacSettings(
@@ -342,7 +342,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
     )
     entry = find_method("ft1")
     method = entry.make(spec, entry.preset("", 1, "paper"))
-    shape = train_loop.LoopConfig(
+    shape = loop_state.LoopConfig(
         envs=8, updates=4, warmup=12, random_steps=100, transitions=300
     )
     steps = 300
@@ -360,8 +360,8 @@ def test_probe_values_and_actions_are_learned(time_limit):
                 actions=1,
                 episode_length=environment.episode_length,
             )
-            collection = train_loop.CollectorState(buffer, episodes, ())
-            return train_loop.RunnerState(learner, collection, jnp.asarray(True))
+            collection = loop_state.CollectorState(buffer, episodes, ())
+            return loop_state.RunnerState(learner, collection, jnp.asarray(True))
 
         def train(key, state, task):
             return train_loop.run_chunk(

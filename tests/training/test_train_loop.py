@@ -12,7 +12,7 @@ from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Selection, Spec
 from rewire_jax.training import compiled_functions as compiled
-from rewire_jax.training import population, train_loop
+from rewire_jax.training import loop_state, population
 from rewire_jax.training.member_functions import MemberFunctions
 from tests.compiles import assert_once, compiles
 
@@ -21,7 +21,7 @@ TASKS = [task.data for task in SCENARIO.tasks]
 # A width that no other test has, so that its traces are counted here alone.
 SPEC = Spec(observations=2, actions=2, hidden=18, depth=1, tasks=len(TASKS))
 WARMUP, RANDOM = 5, 12
-SHAPE = train_loop.LoopConfig(
+SHAPE = loop_state.LoopConfig(
     envs=4, updates=3, warmup=WARMUP, random_steps=RANDOM, transitions=16
 )
 PLAIN = SacSettings(
