@@ -1,5 +1,3 @@
-import dataclasses
-import itertools
 import json
 import os
 import re
@@ -7,9 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,43 +15,17 @@ import pytest
 import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings
-from rewire_jax.methods import METHODS, Entry
-from rewire_jax.methods.base import Method, Spec
-from rewire_jax.methods.regularization import FtL2Settings
-from rewire_jax.methods.rewire import rewire
-from rewire_jax.methods.rewire_settings import RewireSettings
-from rewire_jax.nn import networks
-from rewire_jax.nn.networks import Linear
-from rewire_jax.nn.permutation import permute
-from rewire_jax.run import interrupts, run_state, sweep, sweep_grid, train_run
+from rewire_jax.run import run_state, sweep_grid, train_run
 from rewire_jax.storage import run_folder
 from rewire_jax.training import run_setup
-from tests.compiles import assert_once, compiles
-from tests.tiny import flags, tiny
+from tests.small_sweep import rows, run_sweep, small
+from tests.tiny import flags
 
 GRID: dict[str, list[float]] = {
     "modes": [1, 2, 3, 4],
     "alpha": [0, 1e-2],
     "beta": [0.1, 1, 10],
 }
-
-
-def small(**changes) -> Settings:
-    """Settings of a member; a width of its own, so that its traces are counted here."""
-    settings = dataclasses.replace(
-        tiny(),
-        seeds=1,
-        tasks=2,
-        interactions=320,
-        envs=8,
-        warmup=80,
-        report_every=80,
-        checkpoint_every=160,
-        eval_episodes=2,
-    )
-    sac = dataclasses.replace(settings.sac, hidden=14, depth=1, batch_size=16)
-    return dataclasses.replace(settings, sac=sac, **changes)
 
 
 def command(out: Path, *more: str, most: int = 12) -> list[str]:
@@ -70,17 +40,6 @@ def run(words: list[str], **environment: str) -> subprocess.CompletedProcess:
     return subprocess.run(
         words, capture_output=True, text=True, env=os.environ | environment, check=False
     )
-
-
-def rows(folder: Path, table: str = "results.jsonl") -> dict[tuple, dict]:
-    """Rows of all batches by stage, member and the rest of their place."""
-    rest = "task" if table == "results.jsonl" else "interactions"
-    found = {}
-    for path in folder.glob(f"task-*/batch-*/{table}"):
-        for line in path.read_text().splitlines():
-            row = json.loads(line)
-            found[row["stage"], row["member"], row[rest]] = row
-    return found
 
 
 def near(ours: dict[tuple, dict], theirs: dict[tuple, dict]) -> None:
@@ -303,73 +262,6 @@ def begin(words: list[str]) -> subprocess.Popen[str]:
     return subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True)
 
 
-def run_sweep(folder: Path, settings: Settings, **options) -> Path:
-    return sweep.sweep(settings, folder, **options)
-
-
-# Seven members in slots for eight. A width of its own, so that traces are counted.
-SEVEN = {"axes": {"beta": [1, 2, 3, 4, 5, 6, 7]}, "members_per_batch": 4}
-
-
-def seven() -> Settings:
-    return dataclasses.replace(small(), sac=dataclasses.replace(small().sac, hidden=15))
-
-
-class Unbroken(NamedTuple):
-    folder: Path
-    compiled: Mapping[str, int]
-
-
-@pytest.fixture(scope="module")
-def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Unbroken:
-    """A sweep of seven members, and what it compiled."""
-    with compiles() as counts:
-        folder = run_sweep(tmp_path_factory.mktemp("seven") / "s", seven(), **SEVEN)
-    return Unbroken(folder, counts)
-
-
-def same_tables(folder: Path, other: Path) -> None:
-    paths = [p for p in other.glob("task-*/batch-*/*.jsonl") if p.stem != "timing"]
-    assert len(paths) == 2 * 2 * 2
-    for path in paths:
-        assert (folder / path.relative_to(other)).read_bytes() == path.read_bytes()
-
-
-def test_one_trace_for_all_batches_and_tasks(unbroken: Unbroken) -> None:
-    assert_once(unbroken.compiled, "candidates")
-    assert {place[1] for place in rows(unbroken.folder)} == set(range(7))
-
-
-class Killed(BaseException):
-    pass
-
-
-# Each batch of a task is a chunk to each of four reports, with a checkpoint after two.
-@pytest.mark.parametrize(("how", "chunks"), [("resume", 11), ("join", 3)])
-def test_a_broken_sweep_is_finished_bit_for_bit(
-    how: str,
-    chunks: int,
-    unbroken: Unbroken,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    chunk, made = train_run.Run.chunk, itertools.count()
-
-    def killed(self, *rest):
-        if next(made) == chunks:
-            raise Killed
-        return chunk(self, *rest)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(train_run.Run, "chunk", killed)
-        with pytest.raises(Killed):
-            run_sweep(tmp_path / "sweep", seven(), **SEVEN)
-    (last,) = (tmp_path / "sweep").glob("task-*/batch-*/checkpoints/*-step-*")
-    run_sweep(tmp_path / "sweep", seven(), **SEVEN, **{how: True})
-    assert not last.exists()
-    same_tables(tmp_path / "sweep", unbroken.folder)
-
-
 @pytest.mark.slow
 def test_halving_keeps_the_best_configurations(tmp_path: Path) -> None:
     # Learning rates far apart, so that there is a better and a worse.
@@ -480,25 +372,6 @@ def test_random_and_halved_from_the_command_line(
     assert len({place[1] for place in found if place[0] == 1}) == 2
 
 
-@pytest.mark.parametrize("name", ["chunk", "evaluate"])
-def test_a_sweep_stops_when_asked_to(
-    name: str, unbroken: Unbroken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    called = getattr(train_run.Run, name)
-
-    def interrupted(self, *rest):
-        os.kill(os.getpid(), signal.SIGINT)
-        return called(self, *rest)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(train_run.Run, name, interrupted)
-        with pytest.raises(interrupts.Stopped, match="same command with --resume"):
-            run_sweep(tmp_path / "sweep", seven(), **SEVEN)
-    assert not (tmp_path / "sweep/task-000/batch-001").exists()
-    run_sweep(tmp_path / "sweep", seven(), **SEVEN, resume=True)
-    same_tables(tmp_path / "sweep", unbroken.folder)
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -526,97 +399,3 @@ def test_wrong_arguments_end_in_one_line(
     out = str(tmp_path / "sweep")
     fails(["sweep", "probe/reach", *words, "--out", out], said, capsys)
     assert not (tmp_path / "sweep").exists()
-
-
-class Permuted(NamedTuple):
-    """A plain policy whose hidden layers' outputs are permuted."""
-
-    hidden: tuple
-    head: Linear
-    scores: jax.Array
-
-
-def permuted_l2(spec: Spec, options: FtL2Settings) -> Method:
-    """FT-L2 with a learned permutation; of rewire it has the initial weights alone."""
-    start = rewire(spec, RewireSettings(mode_slots=1, head_slots=spec.tasks))
-
-    def init(key):
-        params, _ = start.init(key)
-        head = jax.tree.map(lambda leaf: leaf[0], params.heads)
-        scores = jnp.tile(jnp.linspace(0, 1, spec.hidden), (spec.depth, 1))
-        hidden = tuple(params.hidden)
-        return Permuted(hidden, head, scores), (jnp.asarray(False), hidden)
-
-    def start_task(key, params, memory, task):
-        del key, task
-        ranks = jnp.argsort(jnp.argsort(params.scores, axis=-1), axis=-1)
-        return params._replace(scores=ranks / (spec.hidden - 1)), memory
-
-    def distribution(params, memory, context, observation):
-        del memory, context
-        x = observation
-        for layer, scores in zip(params.hidden, params.scores, strict=True):
-            x = networks.activate(permute(networks.affine(layer, x), scores, 0.5))
-        return networks.gaussian(networks.affine(params.head, x))
-
-    def moved(params, memory):
-        trained, previous = memory
-        apart = jax.tree.map(
-            lambda a, b: jnp.sum((a - b) ** 2), params.hidden, previous
-        )
-        return jnp.where(trained, sum(jax.tree.leaves(apart)), 0.0)
-
-    def penalty(key, params, memory, context, observation, gaussian):
-        del key, context, observation, gaussian
-        return options.coefficient * moved(params, memory), {}
-
-    def policy(params, memory, task):
-        del memory, task
-        return params
-
-    return Method(
-        init=init,
-        start_task=start_task,
-        distribution=distribution,
-        penalty=penalty,
-        inspect=lambda params, memory, _: {"alignment": moved(params, memory)},
-        end_task=lambda params, memory, task, selection: (
-            params,
-            (jnp.asarray(True), params.hidden),
-        ),
-        policy=policy,
-        act=lambda params, x: distribution(params, None, None, x),
-        size=lambda params, memory: jnp.zeros((), int),
-    )
-
-
-@pytest.mark.slow
-def test_one_mode_is_ft_l2_with_a_permutation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    entry = Entry(permuted_l2, FtL2Settings, lambda *_: FtL2Settings())
-    monkeypatch.setitem(METHODS, "permuted_l2", entry)
-    shared = {"selection_episodes": 0, "seed": 5, "interactions": 640}
-    options = RewireSettings(alignment="off", noise=0.0, tau=0.5, beta=0.3, alpha=1.0)
-    sac = dataclasses.replace(small().sac, hidden=13, lr_policy=1e-2)
-    settings = dataclasses.replace(small(**shared), options=options, sac=sac)
-    swept = run_sweep(tmp_path / "sweep", settings, axes={"modes": [3, 1]})
-    plain = dataclasses.replace(
-        settings, method="permuted_l2", options=FtL2Settings(coefficient=0.3)
-    )
-    folder = train_run.train(plain, tmp_path / "plain")
-    found = rows(swept, "training.jsonl")
-    moved = 0
-    for row in map(json.loads, (folder / "training.jsonl").read_text().splitlines()):
-        modes, one = (
-            found[row["stage"], member, row["interactions"]] for member in (0, 1)
-        )
-        for name, value in row.items():
-            if name not in ("member", "return"):
-                near_value = pytest.approx(value, rel=2e-3, abs=1e-5)
-                assert one[name] == near_value, (name, row)
-        assert one["distillation"] == 0
-        moved += modes["q"] != pytest.approx(row["q"], rel=2e-3)
-    # It is not only the environment that they have in common.
-    assert moved > 8
-    assert one["alignment"] > 0
