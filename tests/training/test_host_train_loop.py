@@ -25,6 +25,7 @@ from rewire_jax.training import exploration, host_episodes, loop_state
 from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import Plan, prepare
 from tests import walk
+from tests.tiny import PLAIN
 
 EVERY = 4
 
@@ -49,7 +50,7 @@ def settings(method: str = "ft1", **changes) -> Settings:
         "report_every": 40,
         "checkpoint_every": 0,
     }
-    sac = dataclasses.replace(quick.sac, hidden=12, depth=1, batch_size=8)
+    sac = dataclasses.replace(quick.sac, hidden=12, depth=1, batch_size=8, **PLAIN)
     return dataclasses.replace(quick, sac=sac, **(shape | changes))
 
 
