@@ -119,7 +119,8 @@ bench_options = $(strip \
 	$(call option,out,$(OUT)) \
 	$(if $(KEEP),--keep))
 
-bench-brax: setup ## Run the methods on a Brax scenario, write tables and plots
+bench-brax: TASKS ?= 2
+bench-brax: setup ## Run the methods on the first tasks of a Brax scenario (TASKS=2), write tables and plots
 	$(RUN) -m experiments.bench_brax $(bench_options)
 
 bench-cw: setup ## The same on a Continual World scenario (TRANSFER=1: also on each single task)
