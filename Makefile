@@ -120,7 +120,8 @@ bench_options = $(strip \
 	$(if $(KEEP),--keep))
 
 bench-brax: TASKS ?= 2
-bench-brax: setup ## Run the methods on the first tasks of a Brax scenario (TASKS=2), write tables and plots
+bench-brax: INTERACTIONS ?= 64000
+bench-brax: setup ## Run the methods on a Brax scenario (two short tasks; see TASKS, INTERACTIONS), write tables and plots
 	$(RUN) -m experiments.bench_brax $(bench_options)
 
 bench-cw: setup ## The same on a Continual World scenario (TRANSFER=1: also on each single task)
