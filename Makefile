@@ -119,8 +119,9 @@ bench_options = $(strip \
 	$(call option,out,$(OUT)) \
 	$(if $(KEEP),--keep))
 
-bench-brax: TASKS ?= 2
-bench-brax: INTERACTIONS ?= 64000
+# Without another profile, it ends in minutes.
+bench-brax: TASKS ?= $(if $(PROFILE),,2)
+bench-brax: INTERACTIONS ?= $(if $(PROFILE),,64000)
 bench-brax: setup ## Run the methods on a Brax scenario (two short tasks; see TASKS, INTERACTIONS), write tables and plots
 	$(RUN) -m experiments.bench_brax $(bench_options)
 
