@@ -119,9 +119,9 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
 
 
 def _quick(base: Settings, tasks: int) -> Settings:
-    """Minutes on two cores: what most seeds need to run on HalfCheetah's first task.
+    """Minutes on two cores: settings with which a HalfCheetah may run after so few.
 
-    Pink noise makes them stand up early; many small updates are as good as fewer large
+    Pink noise makes it stand up earlier; many small updates are as good as fewer large
     ones. Chosen on halfcheetah/forgetting with FT-1: docs/results.md, "Short regimes".
     """
     interactions = min(96_000, base.interactions)
