@@ -12,14 +12,8 @@ from pathlib import Path
 import rewire_jax
 from experiments import suite
 from rewire_jax.core.settings import require
-from rewire_jax.reports.campaign_section import Section, sections
+from rewire_jax.reports.campaign_section import IMPROVEMENT, Section
 from rewire_jax.reports.table import to_markdown
-
-_IMPROVEMENT = (
-    "A cell is the probability that a seed of the row's method has a higher score at "
-    "the end than one of the column's, on the same task, averaged over tasks, with its "
-    "95% bootstrap interval. An interval that contains 0.5 shows no difference."
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +39,7 @@ def improvement(section: Section) -> list[str]:
     return [
         "## Probability of improvement",
         "",
-        _IMPROVEMENT,
+        IMPROVEMENT,
         "",
         *to_markdown(heads, rows),
     ]
@@ -57,12 +51,10 @@ def run(job: Kept) -> None:
     Raises:
       UserError: the campaign cannot be read, or no run is finished.
     """
-    folder = job.runs or Path("runs") / job.file.stem
-    report = rewire_jax.write_campaign_report(job.file, folder)
-    found = sections(report.data)
-    require(bool(found), f"no run of {job.file} is finished")
+    report = rewire_jax.write_campaign_report(job.file, job.runs)
+    require(bool(report.sections), f"no run of {job.file} is finished")
     tidy = {path.name: path.read_text() for path in (report.returns, report.runs)}
-    for number, section in enumerate(found):
+    for number, section in enumerate(report.sections):
         name = "-".join([job.file.stem, *([str(number + 1)] if number else [])])
         kept = dataclasses.replace(
             section.report,

@@ -31,8 +31,8 @@ class Campaign(Flags):
         one if there is an accelerator.
       status: train nothing; print what is finished, running, failed and missing.
       retry: also train runs that were set aside.
-      submit: train each run in a job of submitit: on "slurm", or here
-        on "local".
+      submit: submit each run as a job: to a Slurm cluster, or "local" for this
+        machine.
     """
 
     file: tyro.conf.Positional[Path]

@@ -8,7 +8,7 @@ from typing import Any
 from rewire_jax.core.errors import UserError
 from rewire_jax.reports.data_files import csv_text
 from rewire_jax.run.campaign_file import Campaign, read_campaign
-from rewire_jax.run.campaign_jobs import Job, jobs_of
+from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of
 from rewire_jax.run.campaign_population import grouped
 from rewire_jax.run.campaign_status import Status, status
 from rewire_jax.storage.result_files import Results, Rows
@@ -39,6 +39,7 @@ class CampaignData:
 
     Attributes:
         campaign: what its file says.
+        folder: its folder.
         jobs: its runs, as they are trained.
         status: which are finished, running, failed, missing.
         evaluated: header and evaluations of the runs that have some, by their name.
@@ -47,6 +48,7 @@ class CampaignData:
     """
 
     campaign: Campaign
+    folder: Path
     jobs: tuple[Job, ...]
     status: Status
     evaluated: Mapping[str, tuple[Results, Rows]]
@@ -74,17 +76,18 @@ class CampaignData:
         return "yes" if scenario in self.campaign.tuned_on else "no"
 
 
-def read_campaign_data(file: str | Path, out: str | Path) -> CampaignData:
+def read_campaign_data(file: str | Path, out: str | Path | None = None) -> CampaignData:
     """Reads a campaign, finished or not, from its file and its folder.
 
     Args:
         file: TOML file of the campaign.
-        out: folder of the campaign.
+        out: folder of the campaign; by default `runs/` and the name of the file.
 
     Raises:
         UserError: something in the file is wrong, or a folder holds another run.
     """
-    campaign, root = read_campaign(file), Path(out)
+    campaign = read_campaign(file)
+    root = folder_of(campaign, out)
     jobs = tuple(jobs_of(root, grouped(campaign, root)))
     known = status(jobs)
     evaluated, finished, unreadable = {}, {}, {}
@@ -99,7 +102,7 @@ def read_campaign_data(file: str | Path, out: str | Path) -> CampaignData:
         except UserError as error:
             evaluated.pop(name, None)
             unreadable[name] = str(error)
-    return CampaignData(campaign, jobs, known, evaluated, finished, unreadable)
+    return CampaignData(campaign, root, jobs, known, evaluated, finished, unreadable)
 
 
 def returns_csv(data: CampaignData) -> str:

@@ -14,7 +14,7 @@ from rewire_jax.reports.campaign_data import (
     returns_csv,
     runs_rows,
 )
-from rewire_jax.reports.campaign_section import Section, sections
+from rewire_jax.reports.campaign_section import IMPROVEMENT, Section, sections
 from rewire_jax.reports.data_files import csv_text
 from rewire_jax.reports.table import Table
 
@@ -40,22 +40,24 @@ class CampaignReport:
     sections: tuple[Section, ...]
 
 
-def write_campaign_report(file: str | Path, out: str | Path) -> CampaignReport:
+def write_campaign_report(
+    file: str | Path, out: str | Path | None = None
+) -> CampaignReport:
     """Writes the report of a campaign, finished or not, into its folder.
 
     Args:
         file: TOML file of the campaign.
-        out: folder of the campaign.
+        out: folder of the campaign; by default `runs/` and the name of the file.
 
     Raises:
         UserError: something in the file is wrong, a folder holds another run, or `out`
             cannot be written or has files of these names that no report wrote.
     """
-    data, folder = read_campaign_data(file, out), Path(out)
+    data = read_campaign_data(file, out)
     report = CampaignReport(
-        page=folder / "report.html",
-        returns=folder / "returns.csv",
-        runs=folder / "runs.csv",
+        page=data.folder / "report.html",
+        returns=data.folder / "returns.csv",
+        runs=data.folder / "runs.csv",
         data=data,
         sections=tuple(sections(data)),
     )
@@ -87,6 +89,7 @@ def to_html(report: CampaignReport) -> str:
         progress=_progress(data),
         unfinished=_unfinished(data),
         sections=report.sections,
+        improvement=IMPROVEMENT,
         runs=_runs(data),
     )
 

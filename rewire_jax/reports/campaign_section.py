@@ -24,6 +24,13 @@ from rewire_jax.storage.merged_results import merged
 from rewire_jax.storage.run_results import RunData
 
 _THRESHOLDS = 101
+IMPROVEMENT = (
+    "A cell is the probability that a seed of the row's configuration has a higher "
+    "score at the end than a seed of the column's on the same task, averaged over "
+    "tasks, with its 95% interval. An interval that contains 0.5 shows no difference. "
+    "The intervals are not corrected for the number of comparisons."
+)
+"""How to read `Section.improvement`."""
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.ticker import EngFormatter, StrMethodFormatter
 
-from rewire_jax.reports import statistics
 from rewire_jax.reports.plots import Array, empty, entitle, look
+from rewire_jax.reports.statistics import mean, stratified_bootstrap
 
 _READING = (
     "lines: median over seeds, bands: 95% bootstrap interval of the mean, {} seeds"
@@ -48,8 +48,7 @@ class Curve(NamedTuple):
         ends = np.full((2, self.x.size), np.nan)
         for i, point in enumerate(self.values.T):
             if len(point) > 1 and not np.isnan(point).any():
-                mean = statistics.mean
-                ends[:, i] = statistics.stratified_bootstrap(mean, point[:, None])
+                ends[:, i] = stratified_bootstrap(mean, point[:, None])
         return ends
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from rewire_jax.core.settings import require
 from rewire_jax.run.campaign_file import read_campaign
-from rewire_jax.run.campaign_jobs import Job, Process, default_folder, jobs_of
+from rewire_jax.run.campaign_jobs import Job, Process, folder_of, jobs_of
 from rewire_jax.run.campaign_population import decide
 from rewire_jax.run.campaign_status import hours_left
 from rewire_jax.run.interrupts import Stopped
@@ -216,16 +216,12 @@ def campaign(
     """
     require(workers >= 0, f"--workers must be at least 0, not {workers}")
     made = read_campaign(file)
-    root = Path(out or default_folder(made))
+    root = folder_of(made, out)
     processes = workers or default_workers()
     runs = decide(made, root, slots(processes))
     if not workers and any(len(run.seeds) > 1 for run in runs):
         processes = 1  # A population uses all cores.
-    jobs = jobs_of(root, runs)
-    if retry:
-        for job in jobs:
-            job.forgive()
-    crew = Crew(jobs, slots(processes), limit)
+    crew = Crew(jobs_of(root, runs, retry), slots(processes), limit)
     with _heard(crew):
         crew.work()
     if crew.stops:

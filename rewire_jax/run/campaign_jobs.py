@@ -130,13 +130,18 @@ class Job:
         return start(words, self.notes / "log.txt", cores)
 
 
-def default_folder(campaign: Campaign) -> Path:
-    """Folder of a campaign if none is given."""
-    return Path("runs") / campaign.path.stem
+def folder_of(campaign: Campaign, out: str | Path | None) -> Path:
+    """The folder of a campaign; by default `runs/` and the name of its file."""
+    return Path(out or Path("runs") / campaign.path.stem)
 
 
-def jobs_of(root: Path, runs: Sequence[Run]) -> list[Job]:
+def jobs_of(root: Path, runs: Sequence[Run], retry: bool = False) -> list[Job]:
     """The jobs of runs in a campaign's folder.
+
+    Args:
+      root: the folder.
+      runs: the runs.
+      retry: forget that runs failed, also of those that are set aside.
 
     Raises:
       UserError: a folder holds a run with other settings.
@@ -145,6 +150,9 @@ def jobs_of(root: Path, runs: Sequence[Run]) -> list[Job]:
     for job in jobs:
         if job.started:
             run_folder.compare(job.folder, job.run.settings)
+    if retry:
+        for job in jobs:
+            job.forgive()
     return jobs
 
 

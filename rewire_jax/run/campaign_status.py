@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.run.campaign_file import read_campaign
-from rewire_jax.run.campaign_jobs import Job, default_folder, jobs_of
+from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of
 from rewire_jax.run.campaign_population import grouped
 from rewire_jax.storage.result_files import read_timing
 
@@ -58,7 +58,7 @@ def campaign_status(file: str | Path, out: str | Path | None = None) -> Status:
       UserError: something in the file is wrong, or a folder holds another run.
     """
     made = read_campaign(file)
-    root = Path(out or default_folder(made))
+    root = folder_of(made, out)
     return status(jobs_of(root, grouped(made, root)))
 
 

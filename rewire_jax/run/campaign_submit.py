@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rewire_jax.core.errors import UserError, writing
 from rewire_jax.core.settings import require
 from rewire_jax.run.campaign_file import read_campaign
-from rewire_jax.run.campaign_jobs import Job, default_folder, jobs_of
+from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of
 from rewire_jax.run.campaign_population import submitted_runs
 
 if TYPE_CHECKING:
@@ -98,11 +98,8 @@ def submit(
         ) from error
     require(workers >= 0, f"--workers must be at least 0, not {workers}")
     made = read_campaign(file)
-    root = Path(out or default_folder(made))
-    jobs = jobs_of(root, submitted_runs(made, root))
-    if retry:
-        for job in jobs:
-            job.forgive()
+    root = folder_of(made, out)
+    jobs = jobs_of(root, submitted_runs(made, root), retry)
     left = [job for job in jobs if not job.done and job.reason is None]
     minutes = _MINUTES if limit is None else max(round(limit / 60), 1)
     parameters: dict[str, Any] = {"name": "rewire", "timeout_min": minutes}

@@ -24,13 +24,13 @@ from rewire_jax.run.recorder import Recorder
 from rewire_jax.run.run_state import RunState
 from rewire_jax.storage import run_folder
 from rewire_jax.training import (
-    loop_state,
     memory_estimate,
     population,
     random_keys,
     rollout,
     selection,
 )
+from rewire_jax.training.loop_state import RunnerState
 from rewire_jax.training.random_keys import Stream
 from rewire_jax.training.run_setup import Plan, prepare
 from rewire_jax.training.sac import TrainState
@@ -204,9 +204,7 @@ class Run:
         every = max(times, 1) * unit
         return min(every - done % every, end - done)
 
-    def advance(
-        self, now: RunState, state: loop_state.RunnerState, steps: int
-    ) -> RunState:
+    def advance(self, now: RunState, state: RunnerState, steps: int) -> RunState:
         """Returns the state after these steps; reports members that became inactive."""
         active = np.array(state.active)
         self.recorder.frozen(now, active)

@@ -22,13 +22,17 @@ from rewire_jax.envs.vector_env import open_lanes, shown
 from rewire_jax.training import (
     exploration,
     host_episodes,
-    loop_state,
     population,
     random_keys,
     train_loop,
 )
 from rewire_jax.training.host_rollout import play
-from rewire_jax.training.loop_state import ChunkMetrics, CollectorState, LoopConfig
+from rewire_jax.training.loop_state import (
+    ChunkMetrics,
+    CollectorState,
+    LoopConfig,
+    RunnerState,
+)
 from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Members
 from rewire_jax.training.rollout import Rollout, Step
@@ -39,10 +43,10 @@ Array = NDArray[Any]
 class Loop(NamedTuple):
     """The functions that step environments; see `compiled_functions.Program`."""
 
-    begin: Callable[..., loop_state.RunnerState]
-    chunk: Callable[..., tuple[loop_state.RunnerState, ChunkMetrics]]
+    begin: Callable[..., RunnerState]
+    chunk: Callable[..., tuple[RunnerState, ChunkMetrics]]
     rollout: Callable[..., Rollout]
-    state_shape: Callable[..., loop_state.RunnerState]
+    state_shape: Callable[..., RunnerState]
 
 
 class _Functions(NamedTuple):
@@ -64,7 +68,7 @@ class _Functions(NamedTuple):
     """
 
     roots: Callable[..., jax.Array]
-    begin: Callable[..., loop_state.RunnerState]
+    begin: Callable[..., RunnerState]
     draws: Callable[..., exploration.ActionNoise]
     act: Callable[..., tuple[jax.Array, Any]]
     store_and_update: Callable[..., tuple[Any, Any, Any, Any]]
@@ -168,7 +172,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         step_keys = random_keys.of_step(of.keys(member, index).steps, done - 1)
         state, metrics = train_loop.update_from_buffer(
             step_keys.update,
-            loop_state.RunnerState(learner, CollectorState(buffer, (), ()), active),
+            RunnerState(learner, CollectorState(buffer, (), ()), active),
             done,
             shape.before(done),
             shape.due(done),
@@ -180,9 +184,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         return state.learner, buffer, state.active, metrics
 
     def inspect(member, learner, buffer, index, time):
-        state = loop_state.RunnerState(
-            learner, CollectorState(buffer, (), ()), jnp.asarray(True)
-        )
+        state = RunnerState(learner, CollectorState(buffer, (), ()), jnp.asarray(True))
         key, method = of.keys(member, index).steps, of.method(member)
         return train_loop.inspect(key, state, time, length, method, member.sac)
 
@@ -216,12 +218,12 @@ def _chunk(
     shape: LoopConfig,
     mesh: Mesh,
     members: Members,
-    state: loop_state.RunnerState,
+    state: RunnerState,
     index: int,
     task: Task,
     time: int,
     steps: int,
-) -> tuple[loop_state.RunnerState, ChunkMetrics]:
+) -> tuple[RunnerState, ChunkMetrics]:
     """Collects and updates for a chunk, a multiple of `LoopConfig.update_every`."""
     assert steps % shape.update_every == 0
     learner, (buffer, episodes, extras), active, acting = state
@@ -284,7 +286,7 @@ def _chunk(
         inspected=functions.inspect(members, learner, buffer, index, end)
     )
     episodes, extras = population.place((episodes, extras), mesh)
-    return loop_state.RunnerState(
+    return RunnerState(
         learner,
         CollectorState(buffer, episodes, extras),
         active,

@@ -192,7 +192,7 @@ class _Training:
 
         def skip(carry, index):
             curves = jax.eval_shape(learn, carry, index)[1]
-            return carry, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), curves)
+            return carry, jax.tree.map(jnp.zeros_like, curves)
 
         carry, curves = jax.lax.cond(index < 0, skip, learn, carry, index)
         return carry, (*self.evaluate(carry[0], index), curves)

@@ -10,15 +10,13 @@ import jax.numpy as jnp
 
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools, axes
-from rewire_jax.training import (
-    loop_state,
-    random_keys,
-    replay_buffer,
-    rollout,
-    sac,
-    train_loop,
+from rewire_jax.training import random_keys, replay_buffer, rollout, sac, train_loop
+from rewire_jax.training.loop_state import (
+    ChunkMetrics,
+    CollectorState,
+    LoopConfig,
+    RunnerState,
 )
-from rewire_jax.training.loop_state import CollectorState, LoopConfig, RunnerState
 from rewire_jax.training.population import Members
 from rewire_jax.training.random_keys import StartKeys, TaskKeys
 from rewire_jax.training.sac import TrainState
@@ -113,7 +111,7 @@ class MemberFunctions:
         task: Task,
         time: jax.Array,
         steps: jax.Array,
-    ) -> tuple[RunnerState, loop_state.ChunkMetrics]:
+    ) -> tuple[RunnerState, ChunkMetrics]:
         """Collects and updates for a chunk, with compiled environments."""
         assert isinstance(self.environment, Environment)
         return train_loop.run_chunk(

@@ -66,8 +66,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     - "authors" follows the authors' code where it differs from the text, also in the
       evaluation.
     - "quick" takes minutes on two cores: one round of the tasks, few interactions,
-      narrower layers, and settings of SAC with which so few suffice, pink noise among
-      them.
+      narrower layers, and settings of SAC that learn faster, pink noise among them.
 
     Args:
       scenario: the scenario.
@@ -119,10 +118,10 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
 
 
 def _quick(base: Settings, tasks: int) -> Settings:
-    """Minutes on two cores: settings with which a HalfCheetah may run after so few.
+    """A profile of minutes on two cores.
 
-    Pink noise makes it stand up earlier; many small updates are as good as fewer large
-    ones. Chosen on halfcheetah/forgetting with FT-1: docs/results.md, "Short regimes".
+    Its settings of SAC were chosen on the first task of halfcheetah/forgetting, with
+    FT-1: docs/results.md, "Short regimes".
     """
     interactions = min(96_000, base.interactions)
     return dataclasses.replace(

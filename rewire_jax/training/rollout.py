@@ -228,7 +228,7 @@ def since_reset(
 
     first = over(start)(tasks, policies, _split(keys, count))
     shapes = jax.eval_shape(body, 0, (first,))
-    last = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes[1])
+    last = jax.tree.map(jnp.zeros_like, shapes[1])
     _, last = jax.lax.fori_loop(0, steps, body, (first, last))
     return Rollout(last.score, jnp.full(last.score.shape, steps), last.success)
 

@@ -15,8 +15,9 @@ from rewire_jax.envs.scenarios import Scenario, make_scenario
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Spec
 from rewire_jax.nn import networks
-from rewire_jax.training import compiled_functions, loop_state, population
+from rewire_jax.training import compiled_functions, population
 from rewire_jax.training.compiled_functions import Program
+from rewire_jax.training.loop_state import LoopConfig
 from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Member, Members
 
@@ -177,7 +178,7 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
       UserError: the scenario does not fit the settings.
     """
     environment = scenario.environment
-    shape = loop_state.LoopConfig(
+    shape = LoopConfig(
         envs=settings.envs,
         updates=settings.updates,
         warmup=settings.warmup // settings.envs,

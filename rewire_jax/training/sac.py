@@ -232,7 +232,7 @@ def first_metrics(
     _, shapes = jax.eval_shape(
         lambda: _policy_loss(learner.params, learner, batch, draw, method, sac)
     )
-    metrics = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    metrics = jax.tree.map(jnp.zeros_like, shapes)
     names = ("critic_loss", "q", "temperature")
     return metrics | {name: jnp.zeros(()) for name in names}
 

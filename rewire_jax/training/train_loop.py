@@ -123,7 +123,7 @@ def no_metrics(
         return sac.first_metrics(learner, batch, draw, method, settings)
 
     shapes = jax.eval_shape(first)
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return jax.tree.map(jnp.zeros_like, shapes)
 
 
 def update_from_buffer(

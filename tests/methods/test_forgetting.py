@@ -21,6 +21,7 @@ from rewire_jax.run import run_state
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
 from tests.compiles import assert_once, compiles
+from tests.tiny import PLAIN
 
 # The goal is not observed. The last is opposite the first.
 GOALS = {"northeast": (0.5, 0.5), "northwest": (-0.5, 0.5), "southwest": (-0.5, -0.5)}
@@ -62,11 +63,7 @@ def settings(method: str) -> Settings:
         report_every=6400,
         checkpoint_every=0,
         sac=dataclasses.replace(
-            quick.sac,
-            critic_entropy="sample",
-            policy_states="current",
-            noise_color=0.0,
-            reward_scale=1.0,
+            dataclasses.replace(quick.sac, **PLAIN),
             # A width of its own, so that no other test has compiled the same.
             hidden=32,
             depth=2,
