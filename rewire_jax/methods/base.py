@@ -35,6 +35,7 @@ class Spec(NamedTuple):
       tasks: length of the task sequence.
       network: see `SacSettings`. `networks.policy_of` gives the plain policy of a
         network, `networks.ACTIVATIONS` what is between two layers.
+      updates: SAC updates in a task.
     """
 
     observations: int
@@ -43,11 +44,26 @@ class Spec(NamedTuple):
     depth: int
     tasks: int
     network: Network = "mlp"
+    updates: int = 1
 
     def sizes(self, width: int = 0) -> list[int]:
         """Layer sizes of a plain policy, one MLP; `width` 0 means `hidden` neurons."""
         hidden = [width or self.hidden] * self.depth
         return [self.observations, *hidden, 2 * self.actions]
+
+
+class Round(NamedTuple):
+    """A round of updates that was made.
+
+    Attributes:
+      before: `[]` int, the task's updates before it; shared by all members.
+      after: `[]` int, the same with it.
+      metrics: `[]` each, metrics of its last update, "temperature" among them.
+    """
+
+    before: jax.Array
+    after: jax.Array
+    metrics: dict[str, jax.Array]
 
 
 class Tools(NamedTuple):
@@ -238,6 +254,17 @@ class AdjustUpdates(Protocol):
     def __call__(self, updates: Params, state: MethodState, /) -> Params: ...
 
 
+class AfterRound(Protocol):
+    """Changes parameters and state; called after each round of updates.
+
+    The optimiser's state stays as it is.
+    """
+
+    def __call__(
+        self, params: Params, state: MethodState, made: Round, /
+    ) -> tuple[Params, MethodState]: ...
+
+
 class CriticInput(Protocol):
     """Returns the critics' input besides the action; called at each of their uses.
 
@@ -323,6 +350,7 @@ class Method(NamedTuple):
     penalty: Penalty = lambda *_: (jnp.zeros(()), {})
     inspect: Inspect = lambda *_: {}
     adjust_updates: AdjustUpdates = lambda updates, state: updates
+    after_round: AfterRound = lambda params, state, made: (params, state)
     critic_input: CriticInput = lambda context, observation: observation
     critic_extra: int = 0
     fresh_critic: bool = False

@@ -10,15 +10,18 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
+from rewire_jax.methods import rewire_alignment as alignment
 from rewire_jax.methods import wiring
-from rewire_jax.methods.base import Candidates, Method, Policy, Purpose, Selection, Spec
-from rewire_jax.methods.rewire_losses import (
-    Gaussian,
-    alignment_loss,
-    distillation_loss,
-    gaussian_kl,
-    weight_loss,
+from rewire_jax.methods.base import (
+    Candidates,
+    Method,
+    Policy,
+    Purpose,
+    Round,
+    Selection,
+    Spec,
 )
+from rewire_jax.methods.rewire_losses import Gaussian, distillation_loss, gaussian_kl
 from rewire_jax.methods.rewire_settings import DISTILLED_STATES, RewireSettings
 from rewire_jax.methods.rewire_state import Context, Design, Params, State
 from rewire_jax.nn import networks
@@ -46,6 +49,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         penalty=partial(penalty, design),
         inspect=partial(inspect, design),
         adjust_updates=partial(adjust_updates, design),
+        after_round=partial(after_round, design),
         candidates=partial(candidates, design),
         baseline=True,
         end_task=partial(end_task, design),
@@ -65,10 +69,17 @@ def init(design: Design, key: jax.Array) -> tuple[Params, State]:
     params = Params(
         hidden=hidden,
         heads=tile(head, design.slots),
-        scores=tile(wiring.scores_of(orders[0]), design.options.mode_slots),
+        scores=tile(design.scores(orders[0]), design.options.mode_slots),
         adapters=wiring.identity_adapters(depth, n),
     )
-    return params, State(jnp.zeros((), jnp.int32), hidden, head, orders)
+    return params, State(
+        learned=jnp.zeros((), jnp.int32),
+        previous=hidden,
+        head=head,
+        orders=orders,
+        intensity=jnp.ones(()),
+        temperature=jnp.zeros(()),
+    )
 
 
 def start_task(
@@ -82,16 +93,16 @@ def start_task(
     return Params(
         hidden=params.hidden,
         heads=put(params.heads, task % design.slots, head),
-        scores=tile(wiring.scores_of(order), design.options.mode_slots),
+        scores=tile(design.scores(order), design.options.mode_slots),
         adapters=wiring.identity_adapters(design.spec.depth, design.n),
-    ), state._replace(head=head)
+    ), state._replace(head=head, intensity=jnp.ones(()), temperature=jnp.zeros(()))
 
 
 def draw_context(
     design: Design, key: jax.Array, state: State, purpose: Purpose, extras: object
 ) -> Context:
     """Draws a mode, another mode and, except for acting, noise on scores (Eq. 5)."""
-    del state, extras
+    del extras
     modes, shape = design.modes, (design.spec.depth, design.n)
     mode_key, other_key, noise_key, key = jax.random.split(key, 4)
     mode = jax.random.randint(mode_key, (), 0, modes)
@@ -99,6 +110,7 @@ def draw_context(
     noise = jnp.zeros(shape)
     if purpose != "act":
         noise = design.options.noise * jax.random.gumbel(noise_key, shape)
+        noise *= state.intensity
     return Context(mode, (mode + offset) % modes, noise, key)
 
 
@@ -156,37 +168,40 @@ def penalty(
     l_kl = distillation_loss(other, gaussian, options.distillation)
     l_kl = jnp.where(design.modes > 1, l_kl, 0.0)
     loss = options.alpha * DISTILLED_STATES * l_kl
-    l_sp = alignment_penalty(design, params, state)
+    l_sp = alignment.penalty(design, params, state)
     return loss + options.beta * l_sp, {"distillation": l_kl}
 
 
-def alignment_penalty(design: Design, params: Params, state: State) -> jax.Array:
-    """L_SP or, with alignment "off", L_reg; 0 in the first task."""
-    options = design.options
-    if options.alignment == "off":
-        loss = weight_loss(params.hidden, state.previous)
-    else:
-        loss = alignment_loss(
-            params.hidden,
-            state.previous,
-            params.adapters,
-            options.adapter_tau,
-            expanded=options.alignment == "expanded",
-        )
-    return jnp.where(state.learned > 0, loss, 0.0)
-
-
 def adjust_updates(design: Design, updates: Params, state: State) -> Params:
-    """Multiplies the updates of scores (by K) and adapters."""
-    del state
+    """Multiplies the updates of scores (by K, rate, intensity) and adapters."""
     options = design.options
     rate = 1.0 if options.mode_rate == "gradient" else design.modes
+    rate *= options.score_rate * state.intensity
     return updates._replace(
         scores=updates.scores * rate,
         adapters=jax.tree.map(
             lambda update: update * options.adapter_rate, updates.adapters
         ),
     )
+
+
+def after_round(
+    design: Design, params: Params, state: State, made: Round
+) -> tuple[Params, State]:
+    """Solves for the adapters when it is time, and sets the intensity."""
+    options = design.options
+    if options.alignment == "matching":
+        params = alignment.match_in_time(design, params, state, made)
+    if options.intensity == "linear":
+        share = made.after / design.spec.updates
+        state = state._replace(intensity=jnp.maximum(1 - share / options.anneal, 0.0))
+    if options.intensity == "temperature":
+        now = made.metrics["temperature"]
+        # Before the first update of the policy it is 0.
+        highest = jnp.maximum(state.temperature, now)
+        intensity = jnp.where(now > 0, now / highest, 1.0)
+        state = state._replace(intensity=intensity, temperature=highest)
+    return params, state
 
 
 def mode_policies(design: Design, params: Params, state: State) -> Policy:
@@ -229,7 +244,7 @@ def inspect(
     return {
         "mode_divergence": total / jnp.maximum(modes * (modes - 1), 1),
         # Updates need only its gradient, which is cheaper than its value.
-        "alignment": alignment_penalty(design, params, state),
+        "alignment": alignment.penalty(design, params, state),
     }
 
 
@@ -274,19 +289,16 @@ def end_task(
     params = jax.tree.map(lambda a, b: jnp.where(failed, a, b), began, params)
     latest = state.orders[design.known_slot(state, task) % design.cached]
     order = jnp.where(failed, latest, order)
-    refined = wiring.refine(state.orders, params.adapters)
-    # In the first task there are no earlier weights to align with.
-    refined = jnp.where(state.learned > 0, refined, state.orders)
+    refined = alignment.refined_orders(design, params, state)
     order = order.astype(refined.dtype)
     return Params(
         hidden=params.hidden,
         heads=params.heads,
-        scores=tile(wiring.scores_of(order), design.options.mode_slots),
+        scores=tile(design.scores(order), design.options.mode_slots),
         adapters=identity,
-    ), State(
+    ), state._replace(
         learned=state.learned + 1,
         previous=params.hidden,
-        head=state.head,
         orders=refined.at[slot % design.cached].set(order),
     )
 

@@ -26,8 +26,11 @@ class RewireSettings:
         squared differences of mean and log-std.
       beta: weight of the alignment loss.
       alignment: "norm" is Eq. 11. "expanded" is the authors' form; its gradient in the
-        adapters is different. "off" uses no adapters, pulls the weights towards the
-        previous weights, and does not change cached wirings (Table 3).
+        adapters is different. "matching" solves for the adapters of Eq. 11 instead of
+        training them. "off" uses no adapters, pulls the weights towards the previous
+        weights, and does not change cached wirings (Table 3).
+      match_every: updates between two solutions, with "matching"; the last one is at
+        the end of the task.
       caching: whether each task's wiring is cached; otherwise all tasks use the
         latest wiring (Table 3).
       tau: temperature of the relaxation of the wirings (Eq. 4).
@@ -37,6 +40,15 @@ class RewireSettings:
         converges, earlier with a higher rate; with 1 it takes about 10,000 policy
         updates. With "norm" it never converges.
       noise: scale of Gumbel noise on the scores in updates.
+      score_unit: unit of the scores, `tau`, `noise` and the scores' steps. "range": a
+        task starts with scores from 0 to 1. "neighbour": it starts with scores 1 apart,
+        so that these settings do not depend on the width.
+      score_rate: factor on the scores' learning rate.
+      intensity: what `noise` and the scores' steps are multiplied by during a task.
+        "constant" is 1, as published. "linear" falls from 1 to 0 over the share
+        `anneal` of the task. "temperature" is SAC's temperature divided by its highest
+        value in the task: it falls as the policy becomes sure of its actions.
+      anneal: share of a task, see `intensity`.
       dropout: share of each hidden layer's output that is dropped in training.
       mode_rate: what is multiplied by K. "step" multiplies the step of the scores, as
         in the paper. "gradient" multiplies their gradient, as in the authors' code;
@@ -54,12 +66,17 @@ class RewireSettings:
     alpha: float = 1e-5
     distillation: Literal["kl", "squares"] = "kl"
     beta: float = 1.0
-    alignment: Literal["norm", "expanded", "off"] = "norm"
+    alignment: Literal["norm", "expanded", "matching", "off"] = "norm"
+    match_every: int = 1_000
     caching: bool = True
     tau: float = 1.0
     adapter_tau: float = 0.1
     adapter_rate: float = 1.0
     noise: float = 0.1
+    score_unit: Literal["range", "neighbour"] = "range"
+    score_rate: float = 1.0
+    intensity: Literal["constant", "linear", "temperature"] = "constant"
+    anneal: float = 0.5
     dropout: float = static(0.0)
     mode_rate: Literal["step", "gradient"] = "step"
     select_first: bool = True
@@ -75,11 +92,13 @@ class RewireSettings:
         )
         require(self.head_slots >= 1, "--head-slots must be at least 1")
         require(self.width >= 0, f"--width must be at least 0, not {self.width}")
-        for name in ("alpha", "beta", "noise", "adapter_rate"):
+        require(self.match_every >= 1, "--match-every must be at least 1")
+        for name in ("alpha", "beta", "noise", "adapter_rate", "score_rate"):
             value = getattr(self, name)
             flag = name.replace("_", "-")
             require(0 <= value < jnp.inf, f"--{flag} must be at least 0, not {value}")
         require(0 <= self.dropout < 1, "--dropout must lie in [0, 1)")
+        require(0 < self.anneal <= 1, "--anneal must lie in (0, 1]")
         for name in ("tau", "adapter_tau"):
             value = getattr(self, name)
             flag = name.replace("_", "-")

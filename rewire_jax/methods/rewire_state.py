@@ -36,12 +36,16 @@ class State(NamedTuple):
       head: the current task's head as it was when the task began.
       orders: `[slots, L, n]` int32, the cached wirings; a single one without
         caching.
+      intensity: `[]`, see `RewireSettings.intensity`.
+      temperature: `[]`, SAC's highest one in the current task.
     """
 
     learned: jax.Array
     previous: tuple[Linear, ...]
     head: Linear
     orders: jax.Array
+    intensity: jax.Array
+    temperature: jax.Array
 
 
 class Context(NamedTuple):
@@ -78,6 +82,13 @@ class Design(NamedTuple):
     slots: int
     cached: int
     modes: jax.Array
+
+    def scores(self, orders: jax.Array) -> jax.Array:
+        """Evenly spaced scores `[..., n]` of orders, in the unit of the settings."""
+        scores = wiring.scores_of(orders)
+        return (
+            scores * (self.n - 1) if self.options.score_unit == "neighbour" else scores
+        )
 
     def valid(self) -> jax.Array:
         """`[mode_slots]` bool, the places that hold modes."""

@@ -84,6 +84,9 @@ def make_spec(settings: Settings, environment: Environment | HostEnvironment) ->
         depth=settings.sac.depth,
         tasks=settings.tasks,
         network=settings.sac.network,
+        updates=settings.updates
+        * (settings.interactions - settings.warmup)
+        // (settings.envs * settings.update_every),
     )
 
 

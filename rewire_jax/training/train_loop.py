@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Method
+from rewire_jax.methods.base import Method, Round
 from rewire_jax.training import exploration, random_keys, replay_buffer, rollout, sac
 from rewire_jax.training.loop_state import (
     ChunkMetrics,
@@ -174,7 +174,13 @@ def update_from_buffer(
         def batch(number):
             return replay_buffer.take(buffer, indices[number], time, length)
 
-        return sac.updates(learner, draws, batch, first, updates, method, settings)
+        learner, metrics = sac.updates(
+            learner, draws, batch, first, updates, method, settings
+        )
+        params, method_state = method.after_round(
+            learner.params, learner.method_state, Round(first, first + updates, metrics)
+        )
+        return learner._replace(params=params, method_state=method_state), metrics
 
     # A loop with at most one iteration. All members share `due`, so vmap keeps it.
     learner, metrics = jax.lax.fori_loop(
