@@ -108,6 +108,7 @@ def push(domain, backend, factor):
     return np.linalg.norm((moved - still)[0, 1, :end])
 
 
+@pytest.mark.slow
 def test_moon_slows_a_fall():
     check_free_fall("halfcheetah", "spring", 1)
     check_free_fall("ant", "positional", 2)

@@ -13,7 +13,7 @@ from rewire_jax.envs.scenarios import SCENARIOS, make_scenario
 
 LANES, STEPS = 4, 60
 KEY = jax.random.key(5)
-FIRST, SLOW = ("ant", "hugefoot"), pytest.mark.slow
+FIRST, SLOW = ("halfcheetah", "hugefoot"), pytest.mark.slow
 # These programs run for milliseconds: spend no time on making them fast.
 QUICK = {
     "xla_backend_optimization_level": 0,

@@ -147,7 +147,7 @@ def killing(monkeypatch: pytest.MonkeyPatch, name: str, times: int) -> None:
     [
         ("ft1", "chunk", 7),
         ("ft1", "evaluate", 3),
-        ("packnet", "offline_update", 2),
+        pytest.param("packnet", "offline_update", 2, marks=pytest.mark.slow),
     ],
 )
 def test_nothing_is_there_twice_and_nothing_missing_after_a_kill(

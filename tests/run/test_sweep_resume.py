@@ -53,7 +53,10 @@ class Killed(BaseException):
 
 
 # Each batch of a task is a chunk to each of four reports, with a checkpoint after two.
-@pytest.mark.parametrize(("how", "chunks"), [("resume", 11), ("join", 3)])
+@pytest.mark.parametrize(
+    ("how", "chunks"),
+    [pytest.param("resume", 11, marks=pytest.mark.slow), ("join", 3)],
+)
 def test_a_broken_sweep_is_finished_bit_for_bit(
     how: str,
     chunks: int,
@@ -78,7 +81,9 @@ def test_a_broken_sweep_is_finished_bit_for_bit(
     same_tables(tmp_path / "sweep", unbroken.folder)
 
 
-@pytest.mark.parametrize("name", ["chunk", "evaluate"])
+@pytest.mark.parametrize(
+    "name", ["chunk", pytest.param("evaluate", marks=pytest.mark.slow)]
+)
 def test_a_sweep_stops_when_asked_to(
     name: str, unbroken: Unbroken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -397,7 +397,7 @@ def test_a_killed_run_resumes_in_the_middle_of_an_episode(tmp_path):
     [
         ("ft1", True),
         pytest.param("rewire", True, marks=pytest.mark.slow),
-        ("csp", False),
+        pytest.param("csp", False, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_needed_within_a_task_is_saved(method, overlap, tmp_path, monkeypatch):

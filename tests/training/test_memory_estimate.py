@@ -65,6 +65,7 @@ def test_estimate_is_near_what_is_compiled(seeds):
     assert evaluation / 1.3 < need.evaluation < evaluation * 1.3
 
 
+@pytest.mark.slow
 def test_a_share_of_all_policies_is_paid_for_once():
     small = settings("pnn", tasks=4)
     options = replace(small.options, width=64)
