@@ -62,6 +62,12 @@ def traced_fields(cls: type) -> dict[str, type]:
     }
 
 
+def with_traced(complete: T, given: T) -> T:
+    """Returns settings with the traced values of `given` and the other values as is."""
+    values = {name: getattr(given, name) for name in traced_fields(type(complete))}
+    return dataclasses.replace(complete, **values)  # type: ignore[type-var]
+
+
 @settings
 class SacSettings:
     """Soft Actor-Critic.

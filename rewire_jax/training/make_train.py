@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.core.settings import SacSettings, Settings, require
+from rewire_jax.core.settings import SacSettings, Settings, require, with_traced
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import find_method
@@ -124,7 +124,10 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
     def train(
         key: jax.Array, sac: SacSettings | None = None, options: Any = None
     ) -> Trained:
-        given = sac or settings.sac, options or settings.options
+        given = (
+            with_traced(settings.sac, sac or settings.sac),
+            with_traced(settings.options, options or settings.options),
+        )
         numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), given)
         member = Members(key, *numbers)
         return _Training(settings, functions, budget, tasks, member).run()

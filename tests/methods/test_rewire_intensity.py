@@ -1,10 +1,13 @@
 """The scores' unit and rate, the intensity, and matching within the method."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rewire_jax import make_train
 from rewire_jax.methods.base import Round
 from rewire_jax.methods.rewire_state import Context
 from rewire_jax.nn.networks import Linear
@@ -24,6 +27,7 @@ from tests.rewired import (
     selection,
     trained,
 )
+from tests.tiny import tiny
 
 UPDATES = SPEC._replace(updates=200)
 
@@ -190,3 +194,30 @@ def test_cached_policies_survive_a_permutation_that_matching_must_find():
     for task, wanted in enumerate(before):
         played = method.act(method.policy(done, kept, task), OBSERVATION)
         assert_near(played, wanted)
+
+
+@pytest.mark.slow
+def test_a_run_matches_and_ends_at_rest():
+    settings = dataclasses.replace(tiny(), tasks=2)
+    options = dataclasses.replace(
+        settings.options,
+        alignment="matching",
+        match_every=20,
+        beta=1.0,
+        intensity="linear",
+    )
+    settings = dataclasses.replace(settings, options=options)
+    train = make_train(settings)
+    sweep = jax.vmap(
+        lambda key, anneal: train(
+            key, options=dataclasses.replace(options, anneal=anneal)
+        ),
+        (None, 0),
+    )
+    made = jax.jit(sweep)(jax.random.key(0), jnp.asarray([0.25, 0.5, 1.0]))
+    assert np.all(made.active)
+    np.testing.assert_allclose(made.learned.method_state.intensity, 0, atol=1e-6)
+    # The first part of a task, with other noise, makes another policy.
+    assert len(np.unique(made.returns[:, 1, 0])) == 3
+    orders = np.sort(made.learned.method_state.orders, axis=-1)
+    np.testing.assert_array_equal(orders, np.broadcast_to(np.arange(16), orders.shape))
