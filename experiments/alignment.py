@@ -4,6 +4,7 @@ Hidden layers start from the weights of the previous task. Adam trains them only
 the alignment loss (Eq. 11); random values replace the gradient of the new task. The
 goal is that the order of the adapters no longer changes, and that the weights are the
 previous weights in this order. Then refined wirings (Eq. 12) restore the old policies.
+With "matching" the adapters are not trained but solved for.
 """
 
 import statistics
@@ -19,16 +20,30 @@ import numpy as np
 import optax
 
 from experiments import suite
-from rewire_jax.methods import rewire_losses, wiring
+from rewire_jax.methods import matching, rewire_losses, wiring
 from rewire_jax.nn import networks
 
 # Form of the loss, factor on the adapters' learning rate.
-VARIANTS = (("norm", 1), ("expanded", 1), ("expanded", 10), ("expanded", 0.01))
+VARIANTS = (
+    ("norm", 1),
+    ("expanded", 1),
+    ("expanded", 10),
+    ("expanded", 0.01),
+    ("matching", 0),
+)
+# Measures of a row, with their formats.
+MEASURES = {
+    "distance": ("weights", ".2f"),
+    "moving": ("orders", ".0%"),
+    "actions": ("actions", ".2f"),
+}
 
 NOTES = (
-    "Squared distance of the weights to the previous ones as the adapters order them, "
-    "relative to their square, after so many updates. In parentheses: share of places "
-    "in the adapters' orders that changed in the last 100.",
+    "After so many updates. Weights: squared distance of the weights to the previous "
+    "ones as the adapters order them, relative to their square. Orders: share of the "
+    "places in the adapters' orders that changed in the last 100. Actions: squared "
+    "change of an old policy's outputs by its refined wiring on the new weights, "
+    "relative to their variance over observations.",
 )
 
 
@@ -44,6 +59,7 @@ class Alignment:
       beta: weight of the alignment loss.
       tau: temperature of the adapters' relaxation.
       noise: standard deviation of the new task's gradient.
+      match_every: updates between two solutions, with "matching".
       seeds: number of seeds.
       out: the result files, without a suffix.
     """
@@ -55,6 +71,7 @@ class Alignment:
     beta: float = 100.0
     tau: float = 0.1
     noise: float = 0.01
+    match_every: int = 100
     seeds: int = 3
     out: Path = suite.RESULTS / "alignment"
 
@@ -63,9 +80,7 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
     """One seed.
 
     Returns:
-      `[looks]` squared distance of the weights to the adapted previous ones, relative
-      to the latter's square; and the share of adapters' places that changed in the
-      100 updates before.
+      `[looks]` of each of `MEASURES`.
     """
     key = jax.random.key(seed)
     width, depth = job.width, 3
@@ -76,8 +91,12 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
         previous, jax.tree.map(jnp.zeros_like, list(previous))
     )
 
+    probe = policy_probe(job, key, previous)
+
     def loss(params, expanded=form == "expanded"):
         hidden, adapters = params
+        if form == "matching":
+            adapters = jax.lax.stop_gradient(adapters)
         distance = rewire_losses.alignment_loss(
             hidden, previous, adapters, job.tau, expanded=expanded
         )
@@ -96,7 +115,14 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
         (hidden, adapters), state = adam.update(gradient, state)
         adapters = jax.tree.map(lambda x: adapter_rate * x, adapters)
         step = jax.tree.map(lambda x: -job.rate * x, (hidden, adapters))
-        return optax.apply_updates(params, step), state
+        params = optax.apply_updates(params, step)
+        if form == "matching":
+            due = (index + 1) % job.match_every == 0
+            params = jax.lax.cond(due, match, lambda params: params, params)
+        return params, state
+
+    def match(params):
+        return params[0], matching.match(params[0], previous, params[1])
 
     def orders(params):
         return jnp.argsort(jnp.concatenate(params[1]), axis=-1)
@@ -105,8 +131,12 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
         begin, end = bounds
         before, state = jax.lax.fori_loop(begin, end - 100, update, carry)
         carry = jax.lax.fori_loop(end - 100, end, update, (before, state))
-        distance = loss(carry[0], expanded=False) / job.beta / square
-        return carry, (distance, jnp.mean(orders(before) != orders(carry[0])))
+        params, state = carry
+        moving = jnp.mean(orders(before) != orders(params))
+        if form == "matching":  # as at the end of a task
+            params = match(params)
+        distance = loss(params, expanded=False) / job.beta / square
+        return (params, state), (distance, moving, probe(*params))
 
     params = previous, adapters
     ends = jnp.asarray(job.updates)
@@ -114,20 +144,43 @@ def learn(job: Alignment, form: str, adapter_rate: float, seed: jax.Array):
     return jax.lax.scan(look, (params, adam.init(params)), bounds)[1]
 
 
+def policy_probe(job: Alignment, key: jax.Array, previous: Any):
+    """Returns `(hidden, adapters) -> []`, the change of an old policy's outputs."""
+    head_key, order_key, observation_key = jax.random.split(key, 3)
+    head = networks.init_linear(head_key, job.width, 12)
+    orders = jax.vmap(lambda k: jax.random.permutation(k, job.width))(
+        jax.random.split(order_key, len(previous))
+    )
+    observations = jax.random.normal(observation_key, (512, job.observations))
+
+    def outputs(hidden, orders):
+        return networks.mlp([*wiring.fold(hidden, orders), head], observations)
+
+    before = outputs(previous, orders)
+
+    def change(hidden, adapters):
+        now = outputs(hidden, wiring.refine(orders, adapters))
+        return jnp.mean((now - before) ** 2) / jnp.mean(jnp.var(before, axis=0))
+
+    return change
+
+
 def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Means over seeds, a line for each form and rate."""
+    """Means over seeds, a line for each form, rate and measure."""
     looks = sorted({row["updates"] for row in rows})
-    lines = [["form", "adapter rate", *(f"{updates:,}" for updates in looks)]]
-    for variant in VARIANTS:
-        lines.append([f"{value}" for value in variant])
-        for look in looks:
-            place = (*variant, look)
-            own = [r for r in rows if (r["form"], r["rate"], r["updates"]) == place]
-            distance, moving = (
-                statistics.mean(row[name] for row in own)
-                for name in ("distance", "moving")
-            )
-            lines[-1].append(f"{distance:.2f} ({moving:.0%})")
+    lines = [["form", "adapter rate", "", *(f"{updates:,}" for updates in looks)]]
+    for form, rate in VARIANTS:
+        for measure, (name, shown) in MEASURES.items():
+            line = [form, f"{rate}" if rate else "–", name]
+            for look in looks:
+                place = form, rate, look
+                own = [
+                    row[measure]
+                    for row in rows
+                    if (row["form"], row["rate"], row["updates"]) == place
+                ]
+                line.append(format(statistics.mean(own), shown))
+            lines.append(line)
     return lines
 
 
@@ -139,8 +192,8 @@ def run(job: Alignment) -> None:
         found = np.array(jax.jit(jax.vmap(one))(jnp.arange(job.seeds)), np.float64)
         for seed, look in np.ndindex(job.seeds, len(job.updates)):
             row = {"form": form, "rate": rate, "seed": seed}
-            row |= {"updates": job.updates[look], "distance": found[0, seed, look]}
-            rows.append(row | {"moving": found[1, seed, look]})
+            row["updates"] = job.updates[look]
+            rows.append(row | dict(zip(MEASURES, found[:, seed, look], strict=True)))
     title = f"Alignment alone, width {job.width}, beta {job.beta:g}"
     title += f", mean of {job.seeds} seeds"
     suite.write(job.out, title, table(rows), NOTES, rows)
