@@ -160,6 +160,14 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def cells(page: Path, label: str) -> dict[str, str]:
+    """A run's row of the first table of a report's Markdown, by heading."""
+    table = page.read_text().split("\n\n| ")[1].splitlines()
+    split = [line.strip("| ").split(" | ") for line in table]
+    (found,) = [row for row in split if row[0] == label]
+    return dict(zip(split[0], found, strict=True))
+
+
 def replace_line(path: Path, number: int, text: str) -> None:
     lines = path.read_text().split("\n")
     lines[number - 1] = text

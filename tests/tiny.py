@@ -1,6 +1,8 @@
-"""Settings of a run of seconds."""
+"""Settings of a run of seconds, and the rows that it writes."""
 
 import dataclasses
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -80,3 +82,8 @@ def flags(settings: Settings) -> list[str]:
     names = ("hidden", "depth", "batch_size", *PLAIN)
     values |= {name: getattr(settings.sac, name) for name in names}
     return [w for n, v in values.items() for w in ("--" + n.replace("_", "-"), str(v))]
+
+
+def rows(folder: Path, table: str = "results.jsonl") -> list[dict[str, Any]]:
+    """The rows of a table of a run."""
+    return [json.loads(line) for line in (folder / table).read_text().splitlines()]

@@ -21,7 +21,7 @@ from rewire_jax.run import run_state
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of
 from rewire_jax.training.run_setup import prepare
-from tests.cli.test_cli import fails
+from tests.command_line import fails
 from tests.rendering.test_webpage import embedded, scene
 from tests.tiny import tiny
 
@@ -207,7 +207,7 @@ def test_what_cannot_be_seen(cheetah: Path, tmp_path: Path, capsys) -> None:
     out = ["--out", tmp_path / "x.html"]
 
     def said(*words: object) -> str:
-        return fails(capsys, "render", *map(str, [*words, *out]))
+        return fails(capsys, "render", *words, *out)
 
     assert "holds no run" in said(tmp_path / "none", "--task", 0)
     assert "give member" in said(sweep, "--task", 0)

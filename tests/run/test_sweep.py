@@ -16,42 +16,20 @@ import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.core.errors import UserError
 from rewire_jax.run import run_state, sweep_grid, train_run
-from rewire_jax.storage import run_folder
 from rewire_jax.training import run_setup
-from tests.small_sweep import rows, run_sweep, small
-from tests.tiny import flags
-
-GRID: dict[str, list[float]] = {
-    "modes": [1, 2, 3, 4],
-    "alpha": [0, 1e-2],
-    "beta": [0.1, 1, 10],
-}
+from tests.command_line import fails
+from tests.small_sweep import GRID, near, rows, small, sweep_words
 
 
 def command(out: Path, *more: str, most: int = 12) -> list[str]:
-    """A sweep of the grid from the command line, in two batches."""
-    words = [sys.executable, "-m", "rewire_jax.cli.main", "sweep", "probe/reach"]
-    words += [*flags(small()), "--out", str(out), "--members-per-batch", str(most)]
-    words += ["--k", *map(str, GRID["modes"]), "--alpha", *map(str, GRID["alpha"])]
-    return [*words, "--axis", "beta", *map(str, GRID["beta"]), *more]
+    words = sweep_words(out, *more, most=most)
+    return [sys.executable, "-m", "rewire_jax.cli.main", *words]
 
 
 def run(words: list[str], **environment: str) -> subprocess.CompletedProcess:
     return subprocess.run(
         words, capture_output=True, text=True, env=os.environ | environment, check=False
     )
-
-
-def near(ours: dict[tuple, dict], theirs: dict[tuple, dict]) -> None:
-    """The same rows, with numbers that differ as float sums in another order."""
-    assert ours.keys() == theirs.keys()
-    for place, row in ours.items():
-        assert row.keys() == theirs[place].keys()
-        for name, value in row.items():
-            other = theirs[place][name]
-            if isinstance(value, float):
-                other = pytest.approx(other, rel=2e-3, abs=2e-3)
-            assert value == other, (place, name)
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +158,7 @@ import jax, jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 from rewire_jax.run import sweep_grid
 from rewire_jax.training import run_setup
-from tests.run.test_sweep import GRID, small
+from tests.small_sweep import GRID, small
 
 settings, members = sweep_grid.make_members(small(), sweep_grid.grid(GRID))
 made = run_setup.prepare(settings, members=members)
@@ -252,71 +230,9 @@ def test_who_joins_finishes_what_another_process_left(
     near(rows(folder), rows(swept))
 
 
-def test_there_must_be_a_sweep_to_join(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no sweep"):
-        run_sweep(tmp_path / "none", small(), axes={"beta": [1, 2]}, join=True)
-
-
 def begin(words: list[str]) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
     return subprocess.Popen(words, stdout=pipe, stderr=pipe, text=True)
-
-
-@pytest.mark.slow
-def test_halving_keeps_the_best_configurations(tmp_path: Path) -> None:
-    # Learning rates far apart, so that there is a better and a worse.
-    settings = small(seeds=2, tasks=3, interactions=480)
-    axis = {"lr_policy": [1e-5, 3e-3, 1e-4, 1e-3, 1e30]}
-    options = {"axes": axis, "members_per_batch": 4}
-    whole = rows(run_sweep(tmp_path / "whole", settings, **options))
-    halved = rows(run_sweep(tmp_path / "halved", settings, **options, halving=2))
-    chosen = [range(10)]
-    for stage in (0, 1):
-        scores = {}
-        for configuration in {member // 2 for member in chosen[-1]}:
-            seeds = [2 * configuration, 2 * configuration + 1]
-            mine = [whole[stage, m, t] for m in seeds for t in range(stage + 1)]
-            bad = sum(whole[stage, m, 0]["diverged"] for m in seeds)
-            mean = -np.inf if bad == 2 else np.mean([row["choice"] for row in mine])
-            scores[configuration] = (-bad, mean)
-        best = sorted(scores, key=scores.__getitem__, reverse=True)
-        best = best[: -(-len(best) // 2)]
-        chosen.append([m for c in sorted(best) for m in (2 * c, 2 * c + 1)])
-    assert [len(members) for members in chosen] == [10, 6, 4]
-    for stage, members in enumerate(chosen):
-        assert {place[1] for place in halved if place[0] == stage} == set(members)
-    # The absurd one diverged, is marked, and is not among the best.
-    assert whole[2, 8, 0]["diverged"]
-    assert halved[0, 9, 0]["diverged"]
-    assert 8 not in chosen[1]
-    # Those that are left go on as if the others were there.
-    near(halved, {place: whole[place] for place in halved})
-
-
-def test_settings_that_make_no_sense_are_said(tmp_path: Path) -> None:
-    for options, said in (
-        ({}, "needs an axis"),
-        ({"axes": {"beta": [1]}, "halving": 0}, "--halving"),
-        ({"axes": {"beta": [1]}, "random": -1}, "--random"),
-        ({"axes": {"beta": [1]}, "members_per_batch": -1}, "--members-per-batch"),
-        ({"axes": {"beta": [1]}, "random": 2}, "1 of the configurations are the same"),
-        ({"configurations": [{"beta": 1}, {"alpha": 1}]}, "the same settings"),
-        ({"axes": {"hidden": [1]}}, "no sweep over 'hidden'"),
-        ({"axes": {"beta": np.array([1, 1])}}, "1 of the configurations are the same"),
-    ):
-        with pytest.raises(UserError, match=said):
-            run_sweep(tmp_path / "none", small(), **options)
-    assert not (tmp_path / "none").exists()
-
-
-def fails(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command ends with 2 and one line that says what is wrong."""
-    with pytest.raises(SystemExit) as stopped:
-        main.main(words)
-    assert stopped.value.code == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.splitlines()) == 1
 
 
 def test_another_sweep_or_a_run_is_not_resumed(
@@ -328,7 +244,7 @@ def test_another_sweep_or_a_run_is_not_resumed(
         (["--resume", "--seeds", "2"], "other settings: --seeds"),
         (["--resume", "--axis", "tau", "1", "2"], "other axes"),
     ):
-        fails([*command(swept)[3:], *more], said, capsys)
+        assert said in fails(capsys, *sweep_words(swept), *more)
     for wrong, said in (
         ({"task": 0}, "give member"),
         ({"task": 0, "member": 24}, "no member 24"),
@@ -343,59 +259,7 @@ def test_another_sweep_or_a_run_is_not_resumed(
         rewire_jax.evaluate(swept)
 
 
-def test_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
-    (tmp_path / "sweep").touch()
-    with pytest.raises(UserError, match=r"cannot write to .*task-000: Not a directory"):
-        run_folder.make(tmp_path / "sweep" / "task-000")
-
-
 def test_report_takes_a_sweep(swept: Path, tmp_path: Path) -> None:
     main.main(["report", str(swept), "--out", str(tmp_path)])
     for name in ("members.csv", "configurations.csv", "panels.png"):
         assert (tmp_path / name).read_bytes() == (swept / name).read_bytes()
-
-
-def test_random_and_halved_from_the_command_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    # K is kept; of four configurations two and one go on.
-    words = command(tmp_path / "sweep", most=2)[3:]
-    words = [*words[: words.index("--k")], "--k", "1", "--beta", "0.1", "10"]
-    main.main([*words, "--random", "4", "--halving", "2"])
-    assert "4 configurations" in " ".join(capsys.readouterr().out.split())
-    header = json.loads((tmp_path / "sweep/settings.json").read_text())
-    values = [member["values"] for member in header["members"]]
-    assert {value["modes"] for value in values} == {1}
-    assert len({value["beta"] for value in values}) == 4
-    found = rows(tmp_path / "sweep")
-    assert len({place[1] for place in found if place[0] == 0}) == 4
-    assert len({place[1] for place in found if place[0] == 1}) == 2
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--axis", "beta"], "--axis"),
-        (["--axis", "beta", "1", "--beta", "2"], "beta is an axis twice"),
-        (["--axis", "beta", "one"], "--axis"),
-        (["--k", "1.5"], "--modes must be a whole number"),
-        (["--k", "inf"], "--modes must be finite"),
-        (["--random", "2", "--beta", "1", "nan"], "--beta must be finite"),
-        (["--random", "2", "--k", "1.5", "4"], "--modes must be a whole number"),
-        (["--beta", "1", "--beta", "2"], "beta is an axis twice"),
-        (["--beta", "1", "--processes", "2"], "--processes"),
-        (["--axis", "tau", "0"], "--tau must be above 0"),
-        (["--random", "3", "--beta", "1", "2", "3"], "needs a range"),
-        (["--method", "ft1", "--alpha", "1"], "no sweep over 'alpha'"),
-        (["--beta", "1", "--resume"], "holds no sweep"),
-    ],
-)
-def test_wrong_arguments_end_in_one_line(
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    out = str(tmp_path / "sweep")
-    fails(["sweep", "probe/reach", *words, "--out", out], said, capsys)
-    assert not (tmp_path / "sweep").exists()

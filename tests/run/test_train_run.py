@@ -17,47 +17,27 @@ import pytest
 import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import TaskChange
 from rewire_jax.envs.scenarios import ScenarioSpec, make_scenario
 from rewire_jax.reports.write import write_report
-from rewire_jax.run import run_state, train_run
+from rewire_jax.run import train_run
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
 from tests.compiles import assert_once, compiles
-from tests.tiny import flags, tiny
-
-TABLES = ("results.jsonl", "training.jsonl")
-
-
-def arguments(settings: Settings, out: Path) -> list[str]:
-    return ["train", settings.scenario, "--out", str(out), *flags(settings)]
-
-
-def command(words: list[str]) -> list[str]:
-    return [sys.executable, "-m", "rewire_jax.cli.main", *words]
-
-
-def rows(folder: Path, table: str = "results.jsonl") -> list[dict]:
-    return [json.loads(line) for line in (folder / table).read_text().splitlines()]
+from tests.stopped_run import (
+    TABLES,
+    assert_same_run,
+    assert_same_tables,
+    checkpoints,
+    train_until,
+)
+from tests.tiny import flags, rows, tiny
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
     return train_run.train(tiny(), folder, log=["tensorboard"])
-
-
-def checkpoints(folder: Path) -> list[str]:
-    return sorted(path.name for path in (folder / "checkpoints").iterdir())
-
-
-def leaves(folder: Path, settings: Settings) -> list[np.ndarray]:
-    prepared = run_setup.prepare(settings)
-    learner = jax.eval_shape(prepared.program.init, prepared.stacked)
-    like = {"policy": (learner.params, learner.method_state), "critic": learner.critic}
-    items, _ = checkpoint.load(run_state.kept(folder, None), like)
-    return jax.tree.leaves(items)
 
 
 def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
@@ -79,8 +59,9 @@ def test_every_task_is_evaluated_after_every_task(run: Path) -> None:
 @pytest.mark.slow
 def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "killed"
-    words = arguments(tiny(), folder)
-    process = subprocess.Popen(command(words), stderr=subprocess.PIPE)
+    words = [sys.executable, "-m", "rewire_jax.cli.main", "train", "probe/reach"]
+    words += ["--out", str(folder), *flags(tiny())]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE)
     table = folder / "training.jsonl"
     while process.poll() is None:
         # In the middle of the second task, past its full checkpoint.
@@ -90,11 +71,8 @@ def test_a_killed_run_resumes_bit_for_bit(run: Path, tmp_path: Path) -> None:
         time.sleep(0.002)
     assert process.wait() == -signal.SIGKILL
     assert checkpoints(folder)[-1] != "task-004"
-    subprocess.run(command([*words, "--resume"]), check=True, capture_output=True)
-    for name in TABLES:
-        assert (folder / name).read_bytes() == (run / name).read_bytes()
-    for ours, theirs in zip(leaves(folder, tiny()), leaves(run, tiny()), strict=True):
-        np.testing.assert_array_equal(ours, theirs)
+    subprocess.run([*words, "--resume"], check=True, capture_output=True)
+    assert_same_run(folder, run, tiny())
 
 
 def test_a_run_may_be_older_than_a_setting(run: Path, tmp_path: Path) -> None:
@@ -117,60 +95,6 @@ def test_a_run_may_be_older_than_a_setting(run: Path, tmp_path: Path) -> None:
             train_run.train(dataclasses.replace(tiny(), sac=sac), copy, resume=True)
 
 
-class _Stop(Exception):
-    pass
-
-
-def stop_after(
-    monkeypatch: pytest.MonkeyPatch, times: int, name: str = "chunk"
-) -> None:
-    called = getattr(train_run.Run, name)
-    calls = []
-
-    def counting(self, *rest):
-        if len(calls) == times:
-            raise _Stop
-        calls.append(None)
-        return called(self, *rest)
-
-    monkeypatch.setattr(train_run.Run, name, counting)
-
-
-# PackNet in the updates after its second pruning; CSP with labels in its buffer, in a
-# task that ends with a search.
-@pytest.mark.parametrize(
-    ("method", "times", "name", "resumed"),
-    [
-        ("packnet", 3, "offline_update", "task-001-step-0000040"),
-        pytest.param(
-            *("csp", 5, "chunk", "task-001-step-0000020"), marks=pytest.mark.slow
-        ),
-    ],
-)
-def test_what_a_method_needs_within_a_task_is_saved(
-    method: str,
-    times: int,
-    name: str,
-    resumed: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=1)
-    whole = train_run.train(settings, tmp_path / "whole")
-    with monkeypatch.context() as patch:
-        stop_after(patch, times, name)
-        with pytest.raises(_Stop):
-            train_run.train(settings, tmp_path / "parts")
-    assert checkpoints(tmp_path / "parts")[-1] == resumed
-    parts = train_run.train(settings, tmp_path / "parts", resume=True)
-    for table in TABLES:
-        assert (parts / table).read_bytes() == (whole / table).read_bytes()
-    for ours, theirs in zip(
-        leaves(parts, settings), leaves(whole, settings), strict=True
-    ):
-        np.testing.assert_array_equal(ours, theirs)
-
-
 @pytest.mark.parametrize(("chunks", "damaged"), [(7, 1), (7, 2), (4, 1), (1, 0)])
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     run: Path,
@@ -180,21 +104,14 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with monkeypatch.context() as patch:
-        stop_after(patch, chunks)
-        with pytest.raises(_Stop):
-            train_run.train(tiny(), tmp_path / "run")
+    train_until(monkeypatch, tiny(), tmp_path / "run", chunks)
     found = checkpoint.available(tmp_path / "run" / "checkpoints")
     for path in found[:damaged]:
         largest = max(path.rglob("*"), key=lambda f: f.stat().st_size * f.is_file())
         os.truncate(largest, largest.stat().st_size // 2)
     train_run.train(tiny(), tmp_path / "run", resume=True)
     assert capsys.readouterr().err.count("falling back") == min(damaged, len(found))
-    for name in TABLES:
-        assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes()
-    ours, theirs = (leaves(folder, tiny()) for folder in (tmp_path / "run", run))
-    for one, other in zip(ours, theirs, strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_same_run(tmp_path / "run", run, tiny())
 
 
 @pytest.mark.parametrize("table", TABLES)
@@ -206,8 +123,7 @@ def test_a_table_that_lost_rows_is_written_again(
     (copy / table).write_text("".join(lines)[:-3])
     train_run.train(tiny(), copy, resume=True)
     assert f"{table} has lost or foreign rows" in capsys.readouterr().err
-    for name in TABLES:
-        assert (copy / name).read_bytes() == (run / name).read_bytes()
+    assert_same_tables(copy, run)
     assert checkpoints(copy) == checkpoints(run)
 
 

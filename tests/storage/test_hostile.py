@@ -17,7 +17,7 @@ import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.storage.run_folder import HEADER
 from rewire_jax.storage.run_results import read_run
-from tests.cli.test_cli import TINY
+from tests.command_line import TINY
 
 TASKS = ["--tasks", "3", "--checkpoint-every", "160"]
 NEWEST = "checkpoints/task-003"

@@ -1,7 +1,6 @@
 """Training as a pure function: what a run with a folder learns, as arrays."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import jax
@@ -11,7 +10,7 @@ import pytest
 
 import rewire_jax
 from rewire_jax import UserError, make_act, make_scenario, make_train
-from tests.tiny import tiny
+from tests.tiny import rows, tiny
 
 
 def small(method: str = "rewire") -> rewire_jax.Settings:
@@ -25,10 +24,6 @@ def small(method: str = "rewire") -> rewire_jax.Settings:
             settings, selection_episodes=1, interactions=960, options=options
         )
     return settings
-
-
-def rows(folder: Path, table: str) -> list[dict]:
-    return [json.loads(line) for line in (folder / table).read_text().splitlines()]
 
 
 # Candidates chosen among; updates from the buffer at the end; labels and a budget that

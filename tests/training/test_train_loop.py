@@ -7,91 +7,26 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rewire_jax.core.settings import SacSettings
-from rewire_jax.envs.scenarios import make_scenario
-from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Selection, Spec
-from rewire_jax.training import compiled_functions as compiled
-from rewire_jax.training import loop_state, population
-from rewire_jax.training.member_functions import MemberFunctions
+from rewire_jax.methods.base import Selection
+from rewire_jax.training import population
 from tests.compiles import assert_once, compiles
-
-SCENARIO = make_scenario("probe/reach")
-TASKS = [task.data for task in SCENARIO.tasks]
-# A width that no other test has, so that its traces are counted here alone.
-SPEC = Spec(observations=2, actions=2, hidden=18, depth=1, tasks=len(TASKS))
-WARMUP, RANDOM = 5, 12
-SHAPE = loop_state.LoopConfig(
-    envs=4, updates=3, warmup=WARMUP, random_steps=RANDOM, transitions=16
+from tests.loops import equal
+from tests.reach_loop import (
+    RANDOM,
+    SEEDS,
+    SHAPE,
+    TASKS,
+    WARMUP,
+    begin,
+    build,
+    configurations,
+    crowd,
+    go,
 )
-PLAIN = SacSettings(
-    lr_policy=3e-3,
-    lr_critic=3e-3,
-    hidden=SPEC.hidden,
-    depth=SPEC.depth,
-    batch_size=8,
-    time_limit="bootstrap",
-)
-OTHER = dataclasses.replace(
-    PLAIN,
-    lr_policy=1e-3,
-    lr_critic=5e-3,
-    lr_temperature=1e-2,
-    reward_scale=4.0,
-    target_multiplier=0.3,
-    initial_temperature=0.5,
-    discount=0.8,
-    target_rate=0.1,
-)
-SEEDS = (3, 8)
-MESH = population.mesh(1)
-
-
-def options(method, number):
-    """The settings of a method's configuration number 0 or 1."""
-    settings = find_method(method).preset("probe/reach", len(TASKS), "paper")
-    if method == "rewire":
-        changes = {"modes": 2 + number, "alpha": 0.1**number, "tau": 1 / (1 + number)}
-        settings = dataclasses.replace(settings, mode_slots=3, **changes)
-    return settings.checked()
-
-
-def configurations(method):
-    return [(sac, options(method, n)) for n, sac in enumerate((PLAIN, OTHER))]
-
-
-def build(method, environment=SCENARIO.environment, shape=SHAPE):
-    of = MemberFunctions(environment, find_method(method).make, SPEC, shape)
-    return compiled.build(of, options(method, 0), MESH)
-
-
-def crowd(method="ft1"):
-    return population.stack(population.cross(configurations(method), SEEDS))
-
-
-def begin(program, members, index=0):
-    active = np.ones(len(members.keys), bool)
-    learner = program.init(members)
-    return program.begin(members, learner, active, index, TASKS[index])
-
-
-def go(program, members, state, chunks, time=0, index=0):
-    """The state after the chunks, and their reports; `state` survives."""
-    state = jax.tree.map(jnp.copy, state)
-    reports = []
-    for steps in chunks:
-        state, report = program.chunk(members, state, index, TASKS[index], time, steps)
-        time += steps
-        reports.append(jax.tree.map(np.asarray, report))
-    return state, reports
 
 
 def member(tree, number):
     return jax.tree.map(lambda leaf: leaf[number], tree)
-
-
-def equal(one, other):
-    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 def differ(one, other):
@@ -358,27 +293,3 @@ def test_one_trace_for_all_tasks(method):
     with compiles() as counts:
         sequence(method, 2)
     assert not counts
-
-
-def test_varied_environments_start_each_episode_from_a_reset_of_its_own():
-    varied = SCENARIO.environment._replace(varied=True)
-    shape = SHAPE._replace(transitions=70)
-    programs = [
-        build("ft1", environment, shape)
-        for environment in (varied, SCENARIO.environment)
-    ]
-    length, members = varied.episode_length, crowd()
-    states = [go(p, members, begin(p, members), [3 * length])[0] for p in programs]
-    fresh, stored = (np.asarray(s.collection.buffer.observation) for s in states)
-    # Up to the first end nothing is different, but for rounding: the programs differ.
-    np.testing.assert_allclose(fresh[:, :length], stored[:, :length], atol=1e-5)
-    # One of each seed: two configurations share these.
-    starts = fresh[:2, : 3 * length : length].reshape(-1, 2)
-    assert len(np.unique(starts, axis=0)) == len(starts)
-    same = stored[:, : 3 * length : length]
-    np.testing.assert_array_equal(same[:, 0], same[:, 1])
-    # What an episode led to is still known.
-    finals = [np.asarray(s.collection.buffer.final) for s in states]
-    np.testing.assert_allclose(finals[0][:, 0], finals[1][:, 0], atol=1e-5)
-    parts = go(programs[0], members, begin(programs[0], members), [length - 1, 1, 40])
-    equal(parts[0], states[0])
