@@ -37,7 +37,8 @@ class Program(NamedTuple):
       trial: the same for candidates, see `Method.candidate_score`.
       state_shape: what `begin` gives for the same arguments, as shapes.
       traces: `() -> int`, how often a function that trains was traced so far.
-      size: `(members, learner) -> [members]`, numbers stored.
+      size: `(members, learner) -> [members], [members]`, numbers stored, and numbers of
+        stored states.
       baseline: whether candidates are rolled out at a task's start, too.
     """
 
@@ -53,7 +54,7 @@ class Program(NamedTuple):
     trial: Callable[..., rollout.Rollout]
     state_shape: Callable[..., RunnerState]
     traces: Callable[[], int]
-    size: Callable[..., jax.Array]
+    size: Callable[..., tuple[jax.Array, jax.Array]]
     baseline: bool
 
 

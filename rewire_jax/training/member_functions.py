@@ -209,6 +209,7 @@ class MemberFunctions:
         out_axes = axes(jax.eval_shape(policy, tasks[0]))
         return jax.vmap(policy, out_axes=out_axes)(tasks)
 
-    def size(self, member: Members, learner: TrainState) -> jax.Array:
-        """Returns `[]`, how many numbers the method stores."""
-        return self.method(member).size(learner.params, learner.method_state)
+    def size(self, member: Members, learner: TrainState) -> tuple[jax.Array, jax.Array]:
+        """Returns `[]` each: numbers that the method stores, and of stored states."""
+        method, learned = self.method(member), (learner.params, learner.method_state)
+        return method.size(*learned), method.stored(*learned)
