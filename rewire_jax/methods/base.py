@@ -307,6 +307,17 @@ class CandidatesOf(Protocol):
     ) -> Candidates: ...
 
 
+class AfterBaseline(Protocol):
+    """Changes parameters and state; called after the evaluation of `Method.baseline`.
+
+    `before` is that of `Selection`. If `selection_episodes` is 0, it is not called.
+    """
+
+    def __call__(
+        self, params: Params, state: MethodState, before: jax.Array, /
+    ) -> tuple[Params, MethodState]: ...
+
+
 class EndTask(Protocol):
     """Changes parameters and state; called after the candidates' evaluation.
 
@@ -369,6 +380,7 @@ class Method(NamedTuple):
     offline_sac: Callable[[SacSettings], SacSettings] = lambda sac: sac
     candidates: CandidatesOf | None = None
     baseline: bool = False
+    after_baseline: AfterBaseline | None = None
     in_budget: bool = False
     candidate_score: CandidateScore = "episode"
     end_task: EndTask = lambda params, state, task, selection: (params, state)

@@ -1,4 +1,7 @@
-"""ClonEx-SAC: one policy with a head for each task, and cloning (arXiv 2209.13900)."""
+"""ClonEx-SAC: a head for each task, cloning, exploration by the best earlier policy.
+
+See arXiv 2209.13900; `docs/departures.md` lists what is different here.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +12,7 @@ import optax
 from rewire_jax.core.pytrees import at, count
 from rewire_jax.core.settings import require, settings
 from rewire_jax.methods import cloning
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Candidates, Method, Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 
@@ -23,6 +26,10 @@ class ClonexSettings:
         did in stored states of earlier tasks.
       states: states that are stored of each task.
       batch: stored states in one update of the policy.
+      explore: share of a task's updates up to which an earlier head acts: the one whose
+        policy has the best return on the task before its training. 1% is 10,000
+        interactions of a million. With 0, or without selection episodes, the task's own
+        head acts from the start.
       clip: largest norm of the policy's gradient. Longer gradients are scaled to it.
       head_slots: number of output heads and of slots for stored states. Task t uses
         number t modulo this, so a repeated task uses its earlier head, and its new
@@ -32,6 +39,7 @@ class ClonexSettings:
     coefficient: float = 100.0
     states: int = 10_000
     batch: int = cloning.BATCH
+    explore: float = 0.01
     clip: float = 0.1
     head_slots: int = 4
 
@@ -43,6 +51,9 @@ class ClonexSettings:
         require(
             0 <= self.coefficient < jnp.inf,
             f"--coefficient must be at least 0 and finite, not {self.coefficient}",
+        )
+        require(
+            0 <= self.explore < 1, f"--explore must lie in [0, 1), not {self.explore}"
         )
         require(
             0 < self.clip < jnp.inf,
@@ -79,10 +90,14 @@ class State(NamedTuple):
     Attributes:
       learned: `[]` int32, finished tasks.
       memory: the stored states.
+      explorer: `[]` int32, the head that acts at the start of the task.
+      share: `[]`, share of the task's updates that were made.
     """
 
     learned: jax.Array
     memory: cloning.Memory
+    explorer: jax.Array
+    share: jax.Array
 
 
 def clonex(spec: Spec, options: ClonexSettings) -> Method:
@@ -100,12 +115,42 @@ def clonex(spec: Spec, options: ClonexSettings) -> Method:
             jax.random.split(head_key, slots)
         )
         hidden = tuple(networks.init_mlp(hidden_key, sizes))
+        none = jnp.zeros((), jnp.int32)
         memory = cloning.empty(spec, slots, options.states)
-        return Params(hidden, heads), State(jnp.zeros((), jnp.int32), memory)
+        return Params(hidden, heads), State(none, memory, none, jnp.zeros(()))
+
+    def start_task(key, params, state, task):
+        del key
+        explorer = jnp.asarray(task % slots, jnp.int32)
+        return params, state._replace(explorer=explorer, share=jnp.zeros(()))
+
+    def explores(state):
+        return (state.learned > 0) & (state.share < options.explore)
+
+    def candidates(params, state, task):
+        del task
+        known = jnp.arange(slots) < state.learned
+        policies = jax.vmap(lambda head: [*params.hidden, head])(params.heads)
+        # None at the end of a task, when only `end_task` would be told.
+        return Candidates(policies, known & explores(state))
+
+    def after_baseline(params, state, before):
+        known = jnp.arange(slots) < state.learned
+        returns = jnp.where(known & ~jnp.isnan(before), before, -jnp.inf)
+        best = jnp.argmax(returns).astype(jnp.int32)
+        return params, state._replace(explorer=best)
+
+    def after_round(params, state, made):
+        return params, state._replace(share=made.after / spec.updates)
+
+    def context(key, state, purpose, extras):
+        del key, extras
+        acts = explores(state) & (purpose == "act")
+        return jnp.where(acts, state.explorer, state.learned % slots)
 
     def distribution(params, state, context, observation):
-        del context
-        return act(layers(params, state.learned % slots), observation)
+        del state
+        return act(layers(params, context), observation)
 
     def penalty(key, params, state, context, observation, gaussian):
         del context, observation, gaussian
@@ -142,6 +187,12 @@ def clonex(spec: Spec, options: ClonexSettings) -> Method:
 
     return Method(
         init=init,
+        start_task=start_task,
+        candidates=candidates,
+        baseline=True,
+        after_baseline=after_baseline,
+        after_round=after_round,
+        context=context,
         distribution=distribution,
         penalty=penalty,
         adjust_gradient=clipped,

@@ -62,7 +62,9 @@ METHODS: dict[str, Entry] = {
         rewire_settings.preset,
         together=rewire_settings.together,
     ),
-    "clonex": Entry(clonex.clonex, clonex.ClonexSettings, clonex.preset),
+    "clonex": Entry(
+        clonex.clonex, clonex.ClonexSettings, clonex.preset, selection_episodes=1
+    ),
 }
 
 

@@ -23,6 +23,8 @@ class Program(NamedTuple):
     Attributes:
       init: `members -> TrainState`.
       begin: `(members, learner, active, index, task) -> RunnerState`, a task's start.
+      after_baseline: `(members, state, before) -> state`, after the candidates' rollout
+        at a task's start; the given state is used up; or None.
       chunk: `(members, state, index, task, time, steps) -> state, ChunkMetrics`, takes
         `steps` vector steps; the given state is used up.
       consolidate: `(members, state, index, time) -> TrainState`, the end of a task's
@@ -44,6 +46,7 @@ class Program(NamedTuple):
 
     init: Callable[..., sac.TrainState]
     begin: Callable[..., RunnerState]
+    after_baseline: Callable[..., RunnerState] | None
     chunk: Callable[..., tuple[RunnerState, ChunkMetrics]]
     consolidate: Callable[..., sac.TrainState] | None
     offline_update: Callable[..., RunnerState]
@@ -95,6 +98,9 @@ def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
     over = functools.partial(population.over, mesh)
     return Program(
         init=over(of.init, 0),
+        after_baseline=over(of.after_baseline, 0, 0, 0, donate=(1,))
+        if method.after_baseline
+        else None,
         consolidate=over(of.consolidate, 0, 0, None, None)
         if method.consolidate
         else None,

@@ -103,6 +103,19 @@ class MemberFunctions:
         collection = CollectorState(buffer, episodes, extras)
         return RunnerState(learner, collection, active, acting)
 
+    def after_baseline(
+        self, member: Members, state: RunnerState, before: jax.Array
+    ) -> RunnerState:
+        """Tells the method its candidates' returns at a task's start."""
+        method, learner = self.method(member), state.learner
+        assert method.after_baseline is not None
+        learned = method.after_baseline(learner.params, learner.method_state, before)
+        params, method_state = learned
+        return state._replace(
+            learner=learner._replace(params=params, method_state=method_state),
+            acting=learned if self.shape.overlap else (),
+        )
+
     def chunk(
         self,
         member: Members,
