@@ -22,7 +22,8 @@ class Bench(suite.Job):
 
     Attributes:
       scenario: name of the scenario.
-      methods: names of the methods, run one after the other; "all" for all methods.
+      methods: names of the methods, run one after the other; "all" for those of the
+        paper.
       out: folder for runs and report; by default named after scenario and profile.
       keep: also write the report to experiments/results, to be committed.
     """

@@ -20,7 +20,7 @@ class Table(suite.Experiment):
 
     Attributes:
       scenarios: names of the scenarios.
-      methods: names of the methods, or "all".
+      methods: names of the methods, or "all" for those of the paper.
     """
 
     scenarios: tuple[str, ...]

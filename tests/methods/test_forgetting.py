@@ -39,6 +39,7 @@ OPTIONS: dict[str, dict] = {
     "packnet": {"keep": 0.4},
     "pnn": {"width": 16},
     "csp": {"samples": 64, "estimations": 8},
+    "clonex": {"states": 500},
 }
 
 
@@ -148,8 +149,8 @@ def test_finetuning_forgets_and_the_others_lose_less(
     lost_here = lost(trained(method).scores)
     assert (lost_here[:, 0] < 0.75 * finetuned).all(), (lost_here, finetuned)
     assert lost_here.mean() < 0.6 * lost(trained("ft1").scores).mean()
-    if method == "rewire":
-        # By its alignment, not by its heads alone: without it (beta 0) a third is lost.
+    if method in ("rewire", "clonex"):
+        # Not by heads alone: rewire without alignment (beta 0) loses a third.
         assert lost_here.mean() < 0.1 * lost(trained("ft1").scores).mean()
 
 
@@ -174,12 +175,14 @@ def test_one_trace_for_all_tasks(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
     counts = trained(method).compiled
-    more = ["consolidate"] * (method in ("ewc", "packnet", "csp"))
-    more += ["candidates"] * (method in ("rewire", "csp"))
+    more = ["consolidate"] * (method in ("ewc", "packnet", "csp", "clonex"))
+    more += ["candidates"] * (method in ("rewire", "csp", "clonex"))
+    more += ["after_baseline"] * (method == "clonex")
     # Only PackNet updates after its interactions.
     more += ["offline_update"] * (method == "packnet")
     assert_once(counts, *more)
-    others = {"consolidate", "candidates", "offline_update"} - set(more)
+    others = {"consolidate", "candidates", "after_baseline", "offline_update"}
+    others -= set(more)
     assert not others & counts.keys()
     # Other methods may have played with these before.
     assert counts["episodes"] <= num_plays(method)

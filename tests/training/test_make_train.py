@@ -32,7 +32,8 @@ def rows(folder: Path, table: str) -> list[dict]:
 
 
 # Candidates chosen among; updates from the buffer at the end; labels and a budget that
-# pays for the choice; a fresh critic and policies stored once.
+# pays for the choice; a fresh critic and policies stored once; returns that are told at
+# a task's start.
 @pytest.mark.parametrize(
     "method",
     [
@@ -40,6 +41,7 @@ def rows(folder: Path, table: str) -> list[dict]:
         pytest.param("packnet", marks=pytest.mark.slow),
         pytest.param("csp", marks=pytest.mark.slow),
         pytest.param("pnn", marks=pytest.mark.slow),
+        pytest.param("clonex", marks=pytest.mark.slow),
     ],
 )
 def test_a_run_with_a_folder_comes_to_the_same(method: str, tmp_path: Path) -> None:
