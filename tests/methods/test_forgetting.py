@@ -106,13 +106,18 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Trained
                 tmp_path_factory.mktemp(method) / "run",
                 scenario=SCENARIO,
             )
-        scores = np.full((SEEDS, 1 + len(GOALS), len(GOALS)), np.nan)
-        for line in (folder / "results.jsonl").read_text().splitlines():
-            row = json.loads(line)
-            scores[row["seed"], row["stage"] + 1, row["task"]] = row["return"]
-        return Trained(folder, scores, counts)
+        return Trained(folder, read(folder), counts)
 
     return run
+
+
+def read(folder: Path) -> np.ndarray:
+    """See `Trained.scores`."""
+    scores = np.full((SEEDS, 1 + len(GOALS), len(GOALS)), np.nan)
+    for line in (folder / "results.jsonl").read_text().splitlines():
+        row = json.loads(line)
+        scores[row["seed"], row["stage"] + 1, row["task"]] = row["return"]
+    return scores
 
 
 def costs(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,6 +157,23 @@ def test_finetuning_forgets_and_the_others_lose_less(
     if method in ("rewire", "clonex"):
         # Not by heads alone: rewire without alignment (beta 0) loses a third.
         assert lost_here.mean() < 0.1 * lost(trained("ft1").scores).mean()
+
+
+@pytest.mark.slow
+def test_cloning_keeps_what_rewire_without_alignment_loses(tmp_path: Path) -> None:
+    plain = settings("rewire")
+    losses = []
+    for cloning in (0.0, 10.0):
+        options = dataclasses.replace(
+            plain.options, beta=0.0, cloning=cloning, cloning_states=500
+        )
+        folder = rewire_jax.train(
+            dataclasses.replace(plain, options=options),
+            tmp_path / str(cloning),
+            scenario=SCENARIO,
+        )
+        losses.append(lost(read(folder)).mean())
+    assert losses[1] < 0.1 * losses[0], losses
 
 
 @pytest.mark.parametrize("method", each(KEPT))
