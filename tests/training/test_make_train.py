@@ -24,6 +24,10 @@ def small(method: str = "rewire") -> rewire_jax.Settings:
         settings = dataclasses.replace(
             settings, selection_episodes=1, interactions=960, options=options
         )
+    if method == "clonex":
+        # A weight of 100 makes much of differences in rounding.
+        options = dataclasses.replace(settings.options, states=50, coefficient=1.0)
+        settings = dataclasses.replace(settings, options=options)
     return settings
 
 
