@@ -12,7 +12,7 @@ from pathlib import Path
 import rewire_jax
 from experiments import suite
 from rewire_jax.core.settings import require
-from rewire_jax.methods import METHODS
+from rewire_jax.reports.paper_results import NAMES
 from rewire_jax.reports.report import to_terminal
 
 
@@ -22,7 +22,8 @@ class Bench(suite.Job):
 
     Attributes:
       scenario: name of the scenario.
-      methods: names of the methods, run one after the other; "all" for all methods.
+      methods: names of the methods, run one after the other; "all" for those of the
+        paper.
       out: folder for runs and report; by default named after scenario and profile.
       keep: also write the report to experiments/results, to be committed.
     """
@@ -48,7 +49,7 @@ def run(bench: Bench, single: Sequence[suite.Run] = ()) -> None:
     name = bench.name(bench.scenario)
     out = bench.out or Path("runs") / name
     scenario = bench.scenario_of(bench.scenario)
-    methods = METHODS if "all" in bench.methods else dict.fromkeys(bench.methods)
+    methods = NAMES if "all" in bench.methods else dict.fromkeys(bench.methods)
     runs = [bench.run(scenario, method, out / method) for method in methods]
     done = suite.train([*runs, *single], bench)
     folders = [run.folder for run in runs if run in done]

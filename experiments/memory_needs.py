@@ -11,7 +11,6 @@ from typing import Any
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.methods import METHODS
 from rewire_jax.reports.paper_results import NAMES
 from rewire_jax.training import memory_estimate
 from rewire_jax.training.run_setup import prepare
@@ -70,10 +69,10 @@ def count(scenario: rewire_jax.Scenario, method: str, envs: int = 0) -> dict[str
 
 
 def rows(envs: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Every method with the profile's environments, rewire with others."""
+    """Every method of the paper with the profile's environments, rewire with others."""
     for name in SCENARIOS:
         scenario = rewire_jax.make_scenario(name)
-        for method in METHODS:
+        for method in NAMES:
             yield count(scenario, method)
         for number in envs:
             yield count(scenario, "rewire", number)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from experiments import averages, suite
 from rewire_jax.core.settings import require
-from rewire_jax.methods import METHODS
 from rewire_jax.reports import paper_results
 from rewire_jax.storage.scores import Success
 
@@ -21,7 +20,7 @@ class Table(suite.Experiment):
 
     Attributes:
       scenarios: names of the scenarios.
-      methods: names of the methods, or "all".
+      methods: names of the methods, or "all" for those of the paper.
     """
 
     scenarios: tuple[str, ...]
@@ -39,7 +38,8 @@ class Table(suite.Experiment):
         Raises:
           UserError: wrong arguments.
         """
-        methods = METHODS if "all" in self.methods else (*always, *self.methods)
+        every = paper_results.NAMES
+        methods = every if "all" in self.methods else (*always, *self.methods)
         variants: suite.Variants = {method: (method, {}) for method in methods}
         found: dict[str, list[suite.Run]] = {}
         for name, group in groups.items():

@@ -41,6 +41,7 @@ def write_run(
     tasks: Sequence[str] = TASKS,
     scores: np.ndarray = SCORES,
     size: float = 1.5,
+    stored: float = 0.0,
     rates: np.ndarray | None = None,
     learning: np.ndarray = LEARNING,
     **settings: Any,
@@ -92,6 +93,8 @@ def write_run(
             "interactions": {"training": BUDGET * (stage + 1), "selection": 77},
             "diverged": seed in diverged and stage >= 0,
             "model_size": size + 0.25 * (stage + 1),
+            # As runs without stored states have it.
+            **({"stored_states": stored * (stage + 1)} if stored else {}),
             **success(np.nan if rates is None else rates[stage + 1, task], seed),
         }
         for stage in range(-1, stages)

@@ -261,7 +261,9 @@ class Info(Flags):
             print(f"  {number} {task['name']}")
         print("model size, relative to one plain policy:")
         for method, size in facts["model_size"].items():
-            print(f"  {method:<10}{size:.2f}")
+            stored = facts["stored_states"].get(method)
+            more = f", and {stored:.2f} of stored states" if stored else ""
+            print(f"  {method:<10}{size:.2f}{more}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import flag, require, settings, static, traced
+from rewire_jax.methods import cloning
 from rewire_jax.methods.base import (
     Candidates,
     Method,
@@ -27,6 +28,7 @@ __all__ = [
     "Spec",
     "Tools",
     "at",
+    "cloning",
     "count",
     "find_method",
     "flag",

@@ -179,7 +179,8 @@ class Act(Protocol):
 class Size(Protocol):
     """Returns `[]`, how many numbers are stored; called at each evaluation.
 
-    Not only policies count: rewire and EWC also count previous weights.
+    Not only policies count: rewire and EWC also count previous weights. Stored states,
+    and what is stored with them, count in `Method.stored` instead.
     """
 
     def __call__(self, params: Params, state: MethodState, /) -> jax.Array: ...
@@ -248,6 +249,12 @@ class Inspect(Protocol):
     ) -> dict[str, jax.Array]: ...
 
 
+class AdjustGradient(Protocol):
+    """Changes the gradient of the policy's loss; called before the optimiser."""
+
+    def __call__(self, gradient: Params, state: MethodState, /) -> Params: ...
+
+
 class AdjustUpdates(Protocol):
     """Changes what will be added to the parameters; called after the optimiser."""
 
@@ -300,6 +307,17 @@ class CandidatesOf(Protocol):
     ) -> Candidates: ...
 
 
+class AfterBaseline(Protocol):
+    """Changes parameters and state; called after the evaluation of `Method.baseline`.
+
+    `before` is that of `Selection`. If `selection_episodes` is 0, it is not called.
+    """
+
+    def __call__(
+        self, params: Params, state: MethodState, before: jax.Array, /
+    ) -> tuple[Params, MethodState]: ...
+
+
 class EndTask(Protocol):
     """Changes parameters and state; called after the candidates' evaluation.
 
@@ -327,6 +345,7 @@ class Method(NamedTuple):
     each function says when the loop calls it. The loop itself reads the other fields.
 
     Attributes:
+      stored: how many numbers of stored states there are, see `Size`.
       critic_extra: length of the critics' input besides observation and action.
       fresh_critic: whether each task starts with newly initialised critics.
       offline: updates after `consolidate`, divided by the task's interactions. They
@@ -344,11 +363,13 @@ class Method(NamedTuple):
     policy: PolicyOf
     act: Act
     size: Size
+    stored: Size = lambda params, state: jnp.zeros((), jnp.int32)
     start_task: StartTask = lambda key, params, state, task: (params, state)
     extras: ExtrasOf = lambda *_: ()
     context: ContextOf = lambda *_: ()
     penalty: Penalty = lambda *_: (jnp.zeros(()), {})
     inspect: Inspect = lambda *_: {}
+    adjust_gradient: AdjustGradient = lambda gradient, state: gradient
     adjust_updates: AdjustUpdates = lambda updates, state: updates
     after_round: AfterRound = lambda params, state, made: (params, state)
     critic_input: CriticInput = lambda context, observation: observation
@@ -359,6 +380,7 @@ class Method(NamedTuple):
     offline_sac: Callable[[SacSettings], SacSettings] = lambda sac: sac
     candidates: CandidatesOf | None = None
     baseline: bool = False
+    after_baseline: AfterBaseline | None = None
     in_budget: bool = False
     candidate_score: CandidateScore = "episode"
     end_task: EndTask = lambda params, state, task, selection: (params, state)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import (
+    clonex,
     csp_settings,
     finetune,
     packnet,
@@ -39,7 +40,7 @@ class Entry(NamedTuple):
     together: Callable[[Sequence[Any]], list[Any]] = list
 
 
-# In the order of the paper's Table 1.
+# Those of the paper in the order of its Table 1, then others.
 METHODS: dict[str, Entry] = {
     "ft1": Entry(finetune.ft1, finetune.FinetuneSettings, finetune.preset),
     "ft_l2": Entry(
@@ -60,6 +61,9 @@ METHODS: dict[str, Entry] = {
         rewire_settings.RewireSettings,
         rewire_settings.preset,
         together=rewire_settings.together,
+    ),
+    "clonex": Entry(
+        clonex.clonex, clonex.ClonexSettings, clonex.preset, selection_episodes=1
     ),
 }
 

@@ -21,6 +21,7 @@ from rewire_jax.methods.base import (
     Selection,
     Spec,
 )
+from rewire_jax.methods.rewire_cloning import with_cloning
 from rewire_jax.methods.rewire_losses import Gaussian, distillation_loss, gaussian_kl
 from rewire_jax.methods.rewire_settings import DISTILLED_STATES, RewireSettings
 from rewire_jax.methods.rewire_state import Context, Design, Params, State
@@ -41,7 +42,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         cached=slots if options.caching else 1,
         modes=jnp.asarray(options.modes),
     )
-    return Method(
+    method = Method(
         init=partial(init, design),
         start_task=partial(start_task, design),
         context=partial(draw_context, design),
@@ -57,6 +58,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         act=networks.policy_of(spec.network),
         size=partial(size, design),
     )
+    return with_cloning(design, method) if options.cloning_states else method
 
 
 def init(design: Design, key: jax.Array) -> tuple[Params, State]:

@@ -55,6 +55,10 @@ class RewireSettings:
         Adam almost cancels this factor.
       select_first: whether a mode is chosen by its return also after the first task.
         If not, the first mode is kept, as in the authors' code.
+      cloning: weight of the cloning loss, the KL divergence from what the policies of
+        earlier tasks did in stored states. ClonEx-SAC has 100.
+      cloning_states: states that are stored of each task, for `cloning`; with 0, as in
+        the paper, nothing is stored. ClonEx-SAC stores 10,000.
       head_slots: number of output heads and of cached wirings. Task t uses number t
         modulo this, so a repeated task uses its earlier head and wiring.
       width: neurons in each hidden layer of the policy; 0 means as many as in the
@@ -80,6 +84,8 @@ class RewireSettings:
     dropout: float = static(0.0)
     mode_rate: Literal["step", "gradient"] = "step"
     select_first: bool = True
+    cloning: float = 0.0
+    cloning_states: int = 0
     head_slots: int = 4
     width: int = 0
 
@@ -93,7 +99,18 @@ class RewireSettings:
         require(self.head_slots >= 1, "--head-slots must be at least 1")
         require(self.width >= 0, f"--width must be at least 0, not {self.width}")
         require(self.match_every >= 1, "--match-every must be at least 1")
-        for name in ("alpha", "beta", "noise", "adapter_rate", "score_rate"):
+        require(self.cloning_states >= 0, "--cloning-states must be at least 0")
+        require(
+            self.cloning == 0 or self.cloning_states > 0,
+            f"--cloning {self.cloning} needs --cloning-states, for example 10000",
+        )
+        require(
+            self.caching or not self.cloning_states,
+            "--no-caching: the wirings of earlier tasks are gone; drop "
+            "--cloning-states",
+        )
+        weights = ("alpha", "beta", "noise", "cloning", "adapter_rate", "score_rate")
+        for name in weights:
             value = getattr(self, name)
             flag = name.replace("_", "-")
             require(0 <= value < jnp.inf, f"--{flag} must be at least 0, not {value}")

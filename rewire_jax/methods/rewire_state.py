@@ -1,6 +1,6 @@
 """What the rewiring method trains, keeps and draws, and its sizes."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ class State(NamedTuple):
         caching.
       intensity: `[]`, see `RewireSettings.intensity`.
       temperature: `[]`, SAC's highest one in the current task.
+      memory: states of each different task; () without cloning.
     """
 
     learned: jax.Array
@@ -46,6 +47,7 @@ class State(NamedTuple):
     orders: jax.Array
     intensity: jax.Array
     temperature: jax.Array
+    memory: Any = ()
 
 
 class Context(NamedTuple):

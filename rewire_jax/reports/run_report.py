@@ -165,7 +165,7 @@ def _json(comparison: Comparison, title: str, notes: tuple[str, ...]) -> str:
             "iqm": asdict(summary.iqm),
             "mean_forgetting": asdict(summary.forgetting),
             "forward_transfer": asdict(summary.transfer),
-            **run_tables.run_values(summary),
+            **run_tables.run_values(summary, comparison),
             "published": [
                 theirs
                 and {"table": source.table, "of": source.name, **theirs._asdict()}

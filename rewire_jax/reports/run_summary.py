@@ -111,6 +111,11 @@ class Comparison:
         return self.score.normalised or bool(self.single)
 
     @property
+    def stored(self) -> bool:
+        """Whether a method stores states, which reports list apart from its size."""
+        return any(summary.run.stored_states for summary in self.summaries)
+
+    @property
     def measures(self) -> dict[str, str]:
         """The measures of a task, with their headings."""
         return MEASURES | ({"transfer": "forward transfer"} if self.single else {})

@@ -29,6 +29,7 @@ def results(comparison: Comparison) -> Table:
         f"performance ({comparison.unit})",
         "IQM [95% interval]",
         "model size",
+        *(["stored states"] if comparison.stored else []),
     ]
     for source in comparison.sources:
         heads.append(f"paper's {source.table}, {source.name} ({source.unit})")
@@ -41,6 +42,7 @@ def results(comparison: Comparison) -> Table:
             str(summary.performance),
             str(summary.iqm),
             f"{summary.run.model_size:.2f}",
+            *([f"{summary.run.stored_states:.2f}"] if comparison.stored else []),
         ]
         for source, theirs in zip(comparison.sources, summary.published, strict=True):
             row.append(f"{theirs.mean:.2f} ± {theirs.std:.2f}" if theirs else "–")
@@ -95,7 +97,7 @@ def results_csv(comparison: Comparison) -> str:
                 if comparison.transferred
                 else {}
             )
-            | run_values(summary)
+            | run_values(summary, comparison)
             | {
                 f"paper_{source.key}_{key}": getattr(theirs, key, None)
                 for source, theirs in zip(
@@ -128,11 +130,12 @@ def tasks_csv(comparison: Comparison) -> str:
     return csv_text(rows)
 
 
-def run_values(summary: Summary) -> dict[str, Any]:
+def run_values(summary: Summary, comparison: Comparison) -> dict[str, Any]:
     """The values that a run has once and not for each seed."""
     run = summary.run
     return {
         "model_size": run.model_size,
+        **({"stored_states": run.stored_states} if comparison.stored else {}),
         "training_interactions": run.training,
         "selection_interactions": run.selection,
         "hours_all_seeds": run.hours,

@@ -1,7 +1,7 @@
 """Facts about scenarios, and evaluations of runs."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,14 +26,16 @@ def info(scenario: Scenario) -> dict[str, Any]:
     """Facts about a scenario, JSON-ready.
 
     The model size of a method is the largest that it can reach in this scenario with
-    the paper profile, divided by the size of a plain policy.
+    the paper profile, divided by the size of a plain policy. Stored states are counted
+    in the same way, apart from it.
     """
-    sizes = {}
+    sizes, stored = {}, {}
     for method in METHODS:
         settings = preset(scenario, method)
         spec = make_spec(settings, scenario.environment)
-        numbers = most_stored(method, spec, settings.options.checked())
-        sizes[method] = max(numbers) / base_size(spec)
+        options, base = settings.options.checked(), base_size(spec)
+        sizes[method] = max(most_stored(method, spec, options)) / base
+        stored[method] = max(most_stored(method, spec, options, "stored")) / base
     return {
         "scenario": scenario.name,
         "domain": scenario.domain,
@@ -50,11 +52,20 @@ def info(scenario: Scenario) -> dict[str, Any]:
             for task in scenario.tasks
         ],
         "model_size": sizes,
+        "stored_states": {name: size for name, size in stored.items() if size},
     }
 
 
-def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
+def most_stored(
+    name: str, spec: Spec, options: Any, part: Literal["size", "stored"] = "size"
+) -> list[int]:
     """The largest count of numbers that a method stores in a run over all tasks.
+
+    Args:
+      name: name of the method.
+      spec: sizes of the networks and of the sequence.
+      options: the method's settings.
+      part: the method's function that counts.
 
     Returns:
       Two counts, because the count may depend on which candidate wins: for a run in
@@ -75,7 +86,7 @@ def most_stored(name: str, spec: Spec, options: Any) -> list[int]:
                 after = jnp.where(best_first, after[::-1], after)
                 selection = Selection(jnp.zeros_like(after), after)
             carry = method.end_task(params, method_state, task, selection)
-            return carry, method.size(*carry)
+            return carry, getattr(method, part)(*carry)
 
         _, sizes = jax.lax.scan(one, method.init(key), jnp.arange(spec.tasks))
         return jnp.max(sizes)

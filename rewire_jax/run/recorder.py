@@ -155,7 +155,8 @@ class Recorder:
           scores: mean returns and success rates `[members, tasks]`, by name.
         """
         plan, settings = self.plan, self.plan.settings
-        sizes = np.asarray(plan.program.size(plan.stacked, now.learner))
+        numbers = plan.program.size(plan.stacked, now.learner)
+        sizes, stored = (np.asarray(x) / base_size(plan.spec) for x in numbers)
         selection = np.asarray(now.selection)
         interactions = (stage + 1) * plan.interactions
         rows = [
@@ -173,8 +174,9 @@ class Recorder:
                 # A return can overflow although the parameters have not.
                 "diverged": not now.active[place]
                 or not all(np.isfinite(x[place, index]) for x in scores.values()),
-                "model_size": int(sizes[place]) / base_size(plan.spec),
+                "model_size": float(sizes[place]),
             }
+            | ({"stored_states": float(stored[place])} if stored[place] else {})
             | {name: _finite(float(x[place, index])) for name, x in scores.items()}
             for place, member in enumerate(plan.members)
             for index in range(settings.tasks)

@@ -120,7 +120,9 @@ class Run:
         if not program.baseline:
             return now
         before, selection = self.select(now, state.learner, task, 0)
-        return now._replace(before=before, selection=selection)
+        if program.after_baseline and before is not None:
+            state = program.after_baseline(members, state, before)
+        return now._replace(state=state, before=before, selection=selection)
 
     def select(
         self, now: RunState, learner: TrainState, task: Task, phase: int

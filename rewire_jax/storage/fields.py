@@ -57,6 +57,7 @@ def results(tasks: int, stages: range) -> Fields:
         "interactions.selection": _COUNT,
         "diverged": _FLAG,
         "model_size": Field(float, 0),
+        "stored_states": Field(float, 0, needed=False),
         "return": Field(float, null="diverged"),
         "choice": Field(float, null="diverged", needed=False),
         **_SOLVED,

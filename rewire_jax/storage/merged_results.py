@@ -36,6 +36,7 @@ def merged(runs: Sequence[RunData]) -> RunData:
         },
         finished=min(run.finished for run in runs),
         model_size=max(run.model_size for run in runs),
+        stored_states=max(run.stored_states for run in runs),
         training=max(run.training for run in runs),
         selection=max(run.selection for run in runs),
         curve=tuple(_curve(runs, stage) for stage in range(len(first.tasks))),

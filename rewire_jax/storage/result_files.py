@@ -145,6 +145,7 @@ def read_evaluations(
         rates = [each.name for each in SUCCESS.values() if each.name in row]
         values = {name: number(row[name]) for name in ("return", *rates, *also)}
         values |= {name: float(row[field]) for name, field in _FACTS.items()}
+        values["stored_states"] = float(row.get("stored_states", 0))
         return (check_member(row, seeds), row["stage"], row["task"]), values
 
     return table(path, parse, needed=needed)

@@ -37,6 +37,7 @@ class RunData(Results):
             where missing; the first of the stages is before any training.
         finished: number of leading stages that are evaluated for all tasks and seeds.
         model_size: numbers stored ÷ those of one policy, the maximum over the run.
+        stored_states: the same for numbers of stored states, 0 for most methods.
         training: interactions spent on training, a seed.
         selection: interactions spent on choosing and rolling back, a seed.
         curve: per stage, interactions within the task `[points]` and the score of
@@ -51,6 +52,7 @@ class RunData(Results):
     measured: dict[Score, Array]
     finished: int
     model_size: float
+    stored_states: float
     training: int
     selection: int
     curve: tuple[tuple[Array, Array], ...]
@@ -115,6 +117,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
         measured=measured,
         finished=finished,
         model_size=float(np.nanmax(values["model_size"])),
+        stored_states=float(np.nanmax(values["stored_states"])),
         # Equal for all seeds but those that stopped early because they diverged.
         training=int(np.nanmax(values["training"])),
         selection=int(np.nanmax(values["selection"])),

@@ -23,6 +23,8 @@ class Program(NamedTuple):
     Attributes:
       init: `members -> TrainState`.
       begin: `(members, learner, active, index, task) -> RunnerState`, a task's start.
+      after_baseline: `(members, state, before) -> state`, after the candidates' rollout
+        at a task's start; the given state is used up; or None.
       chunk: `(members, state, index, task, time, steps) -> state, ChunkMetrics`, takes
         `steps` vector steps; the given state is used up.
       consolidate: `(members, state, index, time) -> TrainState`, the end of a task's
@@ -37,12 +39,14 @@ class Program(NamedTuple):
       trial: the same for candidates, see `Method.candidate_score`.
       state_shape: what `begin` gives for the same arguments, as shapes.
       traces: `() -> int`, how often a function that trains was traced so far.
-      size: `(members, learner) -> [members]`, numbers stored.
+      size: `(members, learner) -> [members], [members]`, numbers stored, and numbers of
+        stored states.
       baseline: whether candidates are rolled out at a task's start, too.
     """
 
     init: Callable[..., sac.TrainState]
     begin: Callable[..., RunnerState]
+    after_baseline: Callable[..., RunnerState] | None
     chunk: Callable[..., tuple[RunnerState, ChunkMetrics]]
     consolidate: Callable[..., sac.TrainState] | None
     offline_update: Callable[..., RunnerState]
@@ -53,7 +57,7 @@ class Program(NamedTuple):
     trial: Callable[..., rollout.Rollout]
     state_shape: Callable[..., RunnerState]
     traces: Callable[[], int]
-    size: Callable[..., jax.Array]
+    size: Callable[..., tuple[jax.Array, jax.Array]]
     baseline: bool
 
 
@@ -94,6 +98,9 @@ def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
     over = functools.partial(population.over, mesh)
     return Program(
         init=over(of.init, 0),
+        after_baseline=over(of.after_baseline, 0, 0, 0, donate=(1,))
+        if method.after_baseline
+        else None,
         consolidate=over(of.consolidate, 0, 0, None, None)
         if method.consolidate
         else None,

@@ -209,6 +209,8 @@ class _Training:
         before = None
         if self.method.baseline:
             before, spent = self.select(state.learner, index, task, 0, spent)
+        if self.method.after_baseline and before is not None:
+            state = functions.after_baseline(member, state, before)
         steps, unit = self.budget.steps, self.settings.update_every
         every = self.settings.report_every // (self.settings.envs * unit)
         every = max(every, 1) * unit

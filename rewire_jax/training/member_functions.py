@@ -103,6 +103,19 @@ class MemberFunctions:
         collection = CollectorState(buffer, episodes, extras)
         return RunnerState(learner, collection, active, acting)
 
+    def after_baseline(
+        self, member: Members, state: RunnerState, before: jax.Array
+    ) -> RunnerState:
+        """Tells the method its candidates' returns at a task's start."""
+        method, learner = self.method(member), state.learner
+        assert method.after_baseline is not None
+        learned = method.after_baseline(learner.params, learner.method_state, before)
+        params, method_state = learned
+        return state._replace(
+            learner=learner._replace(params=params, method_state=method_state),
+            acting=learned if self.shape.overlap else (),
+        )
+
     def chunk(
         self,
         member: Members,
@@ -209,6 +222,7 @@ class MemberFunctions:
         out_axes = axes(jax.eval_shape(policy, tasks[0]))
         return jax.vmap(policy, out_axes=out_axes)(tasks)
 
-    def size(self, member: Members, learner: TrainState) -> jax.Array:
-        """Returns `[]`, how many numbers the method stores."""
-        return self.method(member).size(learner.params, learner.method_state)
+    def size(self, member: Members, learner: TrainState) -> tuple[jax.Array, jax.Array]:
+        """Returns `[]` each: numbers that the method stores, and of stored states."""
+        method, learned = self.method(member), (learner.params, learner.method_state)
+        return method.size(*learned), method.stored(*learned)

@@ -193,6 +193,7 @@ def _update_policy(actor, learner, batch, draw, method, sac):
     gradient, metrics = jax.grad(_policy_loss, has_aux=True)(
         actor.params, learner, batch, draw, method, sac
     )
+    gradient = method.adjust_gradient(gradient, learner.method_state)
     policy_state, temperature_state = actor.optimizers
     updates, policy_state = _step(gradient, policy_state, actor.params, sac.lr_policy)
     updates = method.adjust_updates(updates, learner.method_state)

@@ -11,7 +11,6 @@ from experiments.table1_brax import Table1
 from experiments.table2_continual_world import Table2
 from experiments.table3_ablation import Table3
 from rewire_jax.core.errors import UserError
-from rewire_jax.methods import METHODS
 from rewire_jax.reports import paper_results
 from tests.fake_run import EDGE, GAP, SCORES, rows
 from tests.fake_training import NAMES
@@ -101,7 +100,7 @@ def test_table2_is_of_nine_sequences_and_all_methods():
     assert len(sequences) == len(set(sequences)) == 9
     assert {paper_results.sources(name)[0].table for name in sequences} == {"Table 2"}
     runs = Table2().runs_of(dict.fromkeys(sequences[:1], "CW"))
-    assert [run.settings.method for run in runs["CW"]] == list(METHODS)
+    assert [run.settings.method for run in runs["CW"]] == list(paper_results.NAMES)
 
 
 def test_tables_of_what_there_is(trained, tmp_path):

@@ -39,6 +39,7 @@ OPTIONS: dict[str, dict] = {
     "packnet": {"keep": 0.4},
     "pnn": {"width": 16},
     "csp": {"samples": 64, "estimations": 8},
+    "clonex": {"states": 500},
 }
 
 
@@ -105,13 +106,18 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Trained
                 tmp_path_factory.mktemp(method) / "run",
                 scenario=SCENARIO,
             )
-        scores = np.full((SEEDS, 1 + len(GOALS), len(GOALS)), np.nan)
-        for line in (folder / "results.jsonl").read_text().splitlines():
-            row = json.loads(line)
-            scores[row["seed"], row["stage"] + 1, row["task"]] = row["return"]
-        return Trained(folder, scores, counts)
+        return Trained(folder, read(folder), counts)
 
     return run
+
+
+def read(folder: Path) -> np.ndarray:
+    """See `Trained.scores`."""
+    scores = np.full((SEEDS, 1 + len(GOALS), len(GOALS)), np.nan)
+    for line in (folder / "results.jsonl").read_text().splitlines():
+        row = json.loads(line)
+        scores[row["seed"], row["stage"] + 1, row["task"]] = row["return"]
+    return scores
 
 
 def costs(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,9 +154,26 @@ def test_finetuning_forgets_and_the_others_lose_less(
     lost_here = lost(trained(method).scores)
     assert (lost_here[:, 0] < 0.75 * finetuned).all(), (lost_here, finetuned)
     assert lost_here.mean() < 0.6 * lost(trained("ft1").scores).mean()
-    if method == "rewire":
-        # By its alignment, not by its heads alone: without it (beta 0) a third is lost.
+    if method in ("rewire", "clonex"):
+        # Not by heads alone: rewire without alignment (beta 0) loses a third.
         assert lost_here.mean() < 0.1 * lost(trained("ft1").scores).mean()
+
+
+@pytest.mark.slow
+def test_cloning_keeps_what_rewire_without_alignment_loses(tmp_path: Path) -> None:
+    plain = settings("rewire")
+    losses = []
+    for cloning in (0.0, 10.0):
+        options = dataclasses.replace(
+            plain.options, beta=0.0, cloning=cloning, cloning_states=500
+        )
+        folder = rewire_jax.train(
+            dataclasses.replace(plain, options=options),
+            tmp_path / str(cloning),
+            scenario=SCENARIO,
+        )
+        losses.append(lost(read(folder)).mean())
+    assert losses[1] < 0.1 * losses[0], losses
 
 
 @pytest.mark.parametrize("method", each(KEPT))
@@ -174,12 +197,14 @@ def test_one_trace_for_all_tasks(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
     counts = trained(method).compiled
-    more = ["consolidate"] * (method in ("ewc", "packnet", "csp"))
-    more += ["candidates"] * (method in ("rewire", "csp"))
+    more = ["consolidate"] * (method in ("ewc", "packnet", "csp", "clonex"))
+    more += ["candidates"] * (method in ("rewire", "csp", "clonex"))
+    more += ["after_baseline"] * (method == "clonex")
     # Only PackNet updates after its interactions.
     more += ["offline_update"] * (method == "packnet")
     assert_once(counts, *more)
-    others = {"consolidate", "candidates", "offline_update"} - set(more)
+    others = {"consolidate", "candidates", "after_baseline", "offline_update"}
+    others -= set(more)
     assert not others & counts.keys()
     # Other methods may have played with these before.
     assert counts["episodes"] <= num_plays(method)

@@ -79,6 +79,7 @@ WRONG: dict[str, list[tuple[str, Any]]] = {
         ("diverged", 0),
         ("model_size", "1"),
         ("model_size", float("nan")),
+        ("stored_states", -1.0),
         ("return", None),  # of a member that did not diverge
         ("return", float("nan")),
         ("return", float("inf")),

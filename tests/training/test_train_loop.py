@@ -279,7 +279,9 @@ def sequence(method, tasks):
         learner = program.finish(members, learner, index, selection)
         policies = program.policies(members, learner)
         returns.append(program.rollout(stacked, policies, keys, 2).returns)
-        assert np.isfinite(program.size(members, learner)).all()
+        sizes, stored = program.size(members, learner)
+        assert (sizes > 0).all()
+        assert (stored == 0).all()
     assert np.isfinite(returns).all()
 
 
