@@ -248,6 +248,18 @@ class Inspect(Protocol):
     ) -> dict[str, jax.Array]: ...
 
 
+class Hidden(Protocol):
+    """Returns the policy's activations `[batch, n]` in each hidden layer.
+
+    It is the policy in training, on `[batch]` observations. Called for each report with
+    `--plasticity-metrics`.
+    """
+
+    def __call__(
+        self, params: Params, state: MethodState, observation: jax.Array, /
+    ) -> list[jax.Array]: ...
+
+
 class AdjustUpdates(Protocol):
     """Changes what will be added to the parameters; called after the optimiser."""
 
@@ -327,6 +339,8 @@ class Method(NamedTuple):
     each function says when the loop calls it. The loop itself reads the other fields.
 
     Attributes:
+      redo_policy: whether `--redo-every` also resets neurons of the policy. It requires
+        `hidden`, and parameters that are the layers of one plain policy.
       critic_extra: length of the critics' input besides observation and action.
       fresh_critic: whether each task starts with newly initialised critics.
       offline: updates after `consolidate`, divided by the task's interactions. They
@@ -349,6 +363,8 @@ class Method(NamedTuple):
     context: ContextOf = lambda *_: ()
     penalty: Penalty = lambda *_: (jnp.zeros(()), {})
     inspect: Inspect = lambda *_: {}
+    hidden: Hidden | None = None
+    redo_policy: bool = False
     adjust_updates: AdjustUpdates = lambda updates, state: updates
     after_round: AfterRound = lambda params, state, made: (params, state)
     critic_input: CriticInput = lambda context, observation: observation

@@ -26,7 +26,7 @@ from experiments.table1_brax import Table1
 from experiments.table2_continual_world import Table2
 from experiments.table3_ablation import Table3
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import to_json
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import SCENARIOS
 from rewire_jax.methods import METHODS
 from rewire_jax.reports import paper_results
