@@ -182,8 +182,8 @@ def test_neurons_are_reset_in_time(before, after, due):
 
 def test_members_are_reset_as_alone_and_the_branch_stays():
     method, learner = prepared("ft1")
-    healthy = prepared("ft1", jax.random.key(6))[1]
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), learner, healthy)
+    other = prepared("ft1", jax.random.key(6))[1]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), learner, other)
     keys = jax.random.split(KEY)
 
     def reset(key, learner, count):
@@ -191,7 +191,7 @@ def test_members_are_reset_as_alone_and_the_branch_stays():
 
     reset = jax.jit(reset)
     together = jax.vmap(reset, (0, 0, None))
-    for number, alone in enumerate((learner, healthy)):
+    for number, alone in enumerate((learner, other)):
         mine = jax.tree.map(lambda leaf, n=number: leaf[n], together(keys, both, 8))
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6),
