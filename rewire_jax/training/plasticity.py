@@ -74,11 +74,12 @@ def redo_in_time(
     critic = learner.critic, critic_state
     policy = (learner.params, policy_state) if method.redo_policy else ()
 
-    def redo(networks):
-        del networks
-        return _redo(random_keys.named(RedoKeys, key), learner, sample, method, sac)
-
-    critic, policy = jax.lax.cond(due, redo, lambda same: same, (critic, policy))
+    critic, policy = jax.lax.cond(
+        due,
+        lambda _: _redo(random_keys.named(RedoKeys, key), learner, sample, method, sac),
+        lambda parts: parts,
+        (critic, policy),
+    )
     params, policy_state = policy or (learner.params, policy_state)
     return learner._replace(
         params=params,

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,12 @@ from rewire_jax.training import run_setup
 from tests.compiles import assert_once, compiles
 from tests.tiny import flags, tiny
 
+PLASTIC = {
+    "redo_every": 10,
+    "dormant_threshold": 0.5,
+    "l2_init": 0.01,
+    "plasticity_metrics": True,
+}
 TABLES = ("results.jsonl", "training.jsonl")
 
 
@@ -137,14 +144,15 @@ def stop_after(
 
 
 # PackNet in the updates after its second pruning; CSP with labels in its buffer, in a
-# task that ends with a search.
+# task that ends with a search. Then what knobs of SAC need, at a task's start.
 @pytest.mark.parametrize(
-    ("method", "times", "name", "resumed"),
+    ("method", "times", "name", "resumed", "sac"),
     [
-        ("packnet", 3, "offline_update", "task-001-step-0000040"),
+        ("packnet", 3, "offline_update", "task-001-step-0000040", {}),
         pytest.param(
-            *("csp", 5, "chunk", "task-001-step-0000020"), marks=pytest.mark.slow
+            *("csp", 5, "chunk", "task-001-step-0000020", {}), marks=pytest.mark.slow
         ),
+        ("ft1", 5, "chunk", "task-001", PLASTIC),
     ],
 )
 def test_what_a_method_needs_within_a_task_is_saved(
@@ -152,10 +160,14 @@ def test_what_a_method_needs_within_a_task_is_saved(
     times: int,
     name: str,
     resumed: str,
+    sac: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=1)
+    settings = dataclasses.replace(
+        settings, sac=dataclasses.replace(settings.sac, **sac)
+    )
     whole = train_run.train(settings, tmp_path / "whole")
     with monkeypatch.context() as patch:
         stop_after(patch, times, name)
@@ -163,6 +175,9 @@ def test_what_a_method_needs_within_a_task_is_saved(
             train_run.train(settings, tmp_path / "parts")
     assert checkpoints(tmp_path / "parts")[-1] == resumed
     parts = train_run.train(settings, tmp_path / "parts", resume=True)
+    reported = {"dormant_critic", "rank_critic", "dormant_policy", "rank_policy"}
+    for row in rows(parts, "training.jsonl"):
+        assert (reported & row.keys()) == (reported if sac else set())
     for table in TABLES:
         assert (parts / table).read_bytes() == (whole / table).read_bytes()
     for ours, theirs in zip(
