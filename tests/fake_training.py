@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rewire_jax.core.settings import Settings, to_json
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import Scenario
 from tests.fake_run import SCORES, write_cw, write_run
 

@@ -1,8 +1,6 @@
 """Settings of a run: frozen dataclasses whose numbers may be traced."""
 
 import dataclasses
-import hashlib
-import json
 import math
 import numbers
 import typing
@@ -99,6 +97,15 @@ class SacSettings:
         the authors' code.
       noise_color: color of the exploration noise: 0 is white, 1 pink, 2 red
         (Eberhard et al., ICLR 2023). Updates always draw white noise.
+      redo_every: critic updates between two resets of dormant neurons (ReDo, Sokar et
+        al., ICML 2023), 0 for none. It resets the critics and, in `ft1`, `ft_n` and
+        `sac_n`, the policy; other methods need the policy's neurons for earlier tasks.
+      dormant_threshold: a neuron is dormant if its mean absolute activation is at most
+        this number times the mean of its layer.
+      l2_init: coefficient of the squared distance of the critics' weights and biases
+        to their first values, in the critics' loss (Kumar et al., 2023).
+      plasticity_metrics: report the share of dormant neurons and the effective rank of
+        the last hidden layer, of critics and policy.
     """
 
     lr_policy: float = 3e-4
@@ -119,6 +126,10 @@ class SacSettings:
     critic_entropy: CriticEntropy = "sample"
     policy_states: PolicyStates = "current"
     noise_color: float = static(0.0)
+    redo_every: int = 0
+    dormant_threshold: float = 0.025
+    l2_init: float = static(0.0)
+    plasticity_metrics: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -202,6 +213,9 @@ _AT_LEAST: dict[str, float] = {
     "policy_delay": 1,
     "target_delay": 1,
     "noise_color": 0,
+    "redo_every": 0,
+    "dormant_threshold": 0,
+    "l2_init": 0,
 }
 # Counters and floats have 32 bits. The other limits only prevent endless loops.
 _LARGEST = 2**31
@@ -289,60 +303,3 @@ def validate(run: Settings) -> None:
         f"--buffer {run.buffer} cannot hold one step of --envs {run.envs}: raise "
         "--buffer or lower --envs",
     )
-
-
-def to_json(run: Settings) -> dict[str, Any]:
-    """The settings as a JSON-ready dictionary."""
-    return dataclasses.asdict(run)
-
-
-def digest(*settings: Any) -> str:
-    """Identifies settings by their values; a new field with a default changes nothing.
-
-    Args:
-      settings: `Settings`, parts of them, or plain numbers.
-    """
-
-    def values(part: Any) -> Any:
-        if not dataclasses.is_dataclass(part):
-            return part
-        return {
-            field.name: values(value)
-            for field in dataclasses.fields(part)
-            if (value := getattr(part, field.name)) != field.default
-        }
-
-    text = json.dumps([values(part) for part in settings], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def from_json(data: dict[str, Any], options: type) -> Settings:
-    """The settings that `to_json` wrote; `options` is the method's settings class.
-
-    Raises:
-      UserError: if a field is missing or unknown, or its value is invalid.
-    """
-    try:
-        parts = {
-            "sac": _filled(SacSettings, data["sac"]),
-            "options": _filled(options, data["options"]),
-        }
-        run = _filled(Settings, data | parts)
-    except (TypeError, KeyError, AttributeError) as error:
-        raise UserError(f"its settings are damaged ({error})") from error
-    validate(run)
-    return run
-
-
-def _filled(cls: type[T], data: dict[str, Any]) -> T:
-    """A settings class with the saved values; newer fields get their defaults."""
-    fields = {field.name: field.default for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
-    unknown = ", ".join(sorted(data.keys() - fields.keys()))
-    require(not unknown, f"it has the unknown setting {unknown}")
-    lacking = [
-        name
-        for name, default in fields.items()
-        if name not in data and default is dataclasses.MISSING
-    ]
-    require(not lacking, f"it has no setting {', '.join(lacking)}")
-    return cls(**data)

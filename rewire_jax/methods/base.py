@@ -255,6 +255,18 @@ class AdjustGradient(Protocol):
     def __call__(self, gradient: Params, state: MethodState, /) -> Params: ...
 
 
+class Hidden(Protocol):
+    """Returns the policy's activations `[batch, n]` in each hidden layer.
+
+    It is the policy in training, on `[batch]` observations. Called for each report with
+    `--plasticity-metrics`.
+    """
+
+    def __call__(
+        self, params: Params, state: MethodState, observation: jax.Array, /
+    ) -> list[jax.Array]: ...
+
+
 class AdjustUpdates(Protocol):
     """Changes what will be added to the parameters; called after the optimiser."""
 
@@ -346,6 +358,8 @@ class Method(NamedTuple):
 
     Attributes:
       stored: how many numbers of stored states there are, see `Size`.
+      redo_policy: whether `--redo-every` also resets neurons of the policy. It requires
+        `hidden`, and parameters that are the layers of one plain policy.
       critic_extra: length of the critics' input besides observation and action.
       fresh_critic: whether each task starts with newly initialised critics.
       offline: updates after `consolidate`, divided by the task's interactions. They
@@ -370,6 +384,8 @@ class Method(NamedTuple):
     penalty: Penalty = lambda *_: (jnp.zeros(()), {})
     inspect: Inspect = lambda *_: {}
     adjust_gradient: AdjustGradient = lambda gradient, state: gradient
+    hidden: Hidden | None = None
+    redo_policy: bool = False
     adjust_updates: AdjustUpdates = lambda updates, state: updates
     after_round: AfterRound = lambda params, state, made: (params, state)
     critic_input: CriticInput = lambda context, observation: observation

@@ -81,6 +81,7 @@ def csp(spec: Spec, options: CspSettings) -> Method:
         critic_extra=spec.tasks,
         fresh_critic=True,
         consolidate=partial(propose, design),
+        hidden=partial(hidden, design),
         candidates=partial(candidates, design),
         in_budget=True,
         candidate_score=options.candidate_score,
@@ -171,6 +172,17 @@ def distribution(
         mixed = jnp.sum(context[..., None] * outputs, axis=-2)
         x = mixed + newest * networks.affine(layer, x)
     return networks.gaussian(x)
+
+
+def hidden(
+    design: Design, params: Params, state: State, observation: jax.Array
+) -> list[jax.Array]:
+    """See `base.Hidden`; of the mean of the anchors, the newest among them."""
+    anchors = put(state.anchors, state.frozen, params)
+    used = jnp.arange(design.spec.tasks) <= state.frozen
+    mean = fold(anchors, used / (state.frozen + 1))
+    activation = networks.ACTIVATIONS[design.spec.network]
+    return networks.hidden_activations(mean, observation, activation)
 
 
 def critic_input(context: jax.Array, observation: jax.Array) -> jax.Array:

@@ -135,6 +135,10 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
         del context
         return play(state.columns, params, state.learned, observation, activation)
 
+    def hidden(params, state, observation):
+        arguments = state.columns, params, state.learned, observation, activation
+        return run_columns(*arguments)[0]
+
     def end_task(params, state, task, selection):
         del selection
         columns = put(state.columns, task, params)
@@ -159,6 +163,7 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
         policy=policy,
         act=act_of(spec.network),
         size=size,
+        hidden=hidden,
         start_task=start_task,
         end_task=end_task,
     )
@@ -183,7 +188,19 @@ def play(
     observation: jax.Array,
     activation: networks.Activation,
 ) -> tuple[jax.Array, jax.Array]:
-    """Mean and log-std of a column; gradients flow only into this column.
+    """Mean and log-std of a column, each `[..., actions]`; see `run_columns`."""
+    arguments = columns, column, place, observation, activation
+    return networks.gaussian(run_columns(*arguments)[1])
+
+
+def run_columns(
+    columns: Column,
+    column: Column,
+    place: jax.Array,
+    observation: jax.Array,
+    activation: networks.Activation,
+) -> tuple[list[jax.Array], jax.Array]:
+    """`run_column`, and what comes before; gradients flow only into this column.
 
     Args:
       columns: `[tasks, ...]`, of which the first `place` come before it.
@@ -193,7 +210,7 @@ def play(
       activation: of the hidden layers.
 
     Returns:
-      Mean and log-std, each `[..., actions]`.
+      As `run_column`.
     """
     # A loop of unknown length has no gradient, and needs none.
     columns, observation = jax.lax.stop_gradient((columns, observation))
@@ -211,8 +228,7 @@ def play(
         ]
 
     earlier = jax.lax.fori_loop(0, place, join, nothing)
-    _, output = run_column(column, place, earlier, observation, activation)
-    return networks.gaussian(output)
+    return run_column(column, place, earlier, observation, activation)
 
 
 def run_column(

@@ -173,7 +173,8 @@ def _pulled(
         distance = sum(jax.tree.leaves(terms))
         return coefficient * distance, {"distance": distance}
 
-    return plain._replace(init=init, penalty=penalty)
+    # The pull would undo a reset of the policy's neurons.
+    return plain._replace(init=init, penalty=penalty, redo_policy=False)
 
 
 def fisher_diagonal(

@@ -49,6 +49,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         distribution=partial(distribution, design),
         penalty=partial(penalty, design),
         inspect=partial(inspect, design),
+        hidden=partial(hidden, design),
         adjust_updates=partial(adjust_updates, design),
         after_round=partial(after_round, design),
         candidates=partial(candidates, design),
@@ -248,6 +249,15 @@ def inspect(
         # Updates need only its gradient, which is cheaper than its value.
         "alignment": alignment.penalty(design, params, state),
     }
+
+
+def hidden(
+    design: Design, params: Params, state: State, observation: jax.Array
+) -> list[jax.Array]:
+    """See `base.Hidden`; of the first mode, without noise and dropout."""
+    first = jax.tree.map(lambda x: x[0], mode_policies(design, params, state))
+    activation = networks.ACTIVATIONS[design.spec.network]
+    return networks.hidden_activations(first, observation, activation)
 
 
 def select_order(

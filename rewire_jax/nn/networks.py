@@ -198,6 +198,22 @@ def mlp(
     return output
 
 
+def hidden_activations(
+    layers: Sequence[Linear], x: jax.Array, activation: Activation = activate
+) -> list[jax.Array]:
+    """Activations `[..., neurons]` of each hidden layer of the `MLP`."""
+    activations = []
+    for layer in layers[:-1]:
+        x = activation(affine(layer, x))
+        activations.append(x)
+    return activations
+
+
+def sizes(layers: Sequence[Linear]) -> list[int]:
+    """Those with which `init_mlp` makes layers of the same shapes."""
+    return [layers[0].weight.shape[-1], *(layer.bias.shape[-1] for layer in layers)]
+
+
 def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Splits `[..., 2 * actions]` into mean and clipped log-std, `[..., actions]`."""
     mean, log_std = jnp.split(output, 2, axis=-1)

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings, digest, from_json
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.settings_json import digest, from_json
 from rewire_jax.methods import find_method
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.json_lines import reading

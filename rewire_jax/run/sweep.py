@@ -25,7 +25,8 @@ import numpy as np
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
-from rewire_jax.core.settings import Settings, require, to_json, validate
+from rewire_jax.core.settings import Settings, require, validate
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.run import loggers, run_state
 from rewire_jax.run.interrupts import Stopped, interruptible

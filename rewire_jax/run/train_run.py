@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.settings import Settings, to_json
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.base import Task
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods.base import Selection

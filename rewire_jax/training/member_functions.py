@@ -89,7 +89,7 @@ class MemberFunctions:
         learner = learner._replace(params=params, method_state=method_state)
         if method.fresh_critic:
             critic = sac.init_critic(keys.critic, self.spec, method.critic_extra)
-            learner = learner._replace(critic=critic)
+            learner = sac.start_critic(learner, critic, member.sac)
         extras = method.extras(keys.extras, method_state, None, episodes.steps)
         buffer = replay_buffer.create(
             episodes.state.observation,

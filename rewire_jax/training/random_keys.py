@@ -71,6 +71,34 @@ class StepKeys(NamedTuple):
     noise: jax.Array
 
 
+class UpdateKeys(NamedTuple):
+    """Keys of a round of updates.
+
+    Attributes:
+      indices: key of the transitions.
+      draws: key of the updates' draws.
+      redo: see `RedoKeys`.
+    """
+
+    indices: jax.Array
+    draws: jax.Array
+    redo: jax.Array
+
+
+class RedoKeys(NamedTuple):
+    """Keys of a reset of dormant neurons.
+
+    Attributes:
+      batch: key of the batch on which they are dormant.
+      critic: key of the critics' new weights.
+      policy: key of the policy's new weights.
+    """
+
+    batch: jax.Array
+    critic: jax.Array
+    policy: jax.Array
+
+
 class CollectKeys(NamedTuple):
     """Keys of a step's actions.
 

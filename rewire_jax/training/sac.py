@@ -28,6 +28,7 @@ class TrainState(NamedTuple):
       target: the same, slowly updated towards `critic`.
       log_temperature: `[]`.
       optimizers: Adam's states of policy, critics and temperature.
+      critic_start: the critics' first layers, with `l2_init`; else `()`.
     """
 
     params: Params
@@ -36,6 +37,7 @@ class TrainState(NamedTuple):
     target: Any
     log_temperature: jax.Array
     optimizers: tuple[Any, Any, Any]
+    critic_start: Any = ()
 
 
 def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainState:
@@ -43,10 +45,16 @@ def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainS
     policy_key, critic_key = jax.random.split(key)
     params, method_state = method.init(policy_key)
     critic = init_critic(critic_key, spec, method.critic_extra)
-    return restart(
-        TrainState(params, method_state, critic, critic, jnp.zeros(()), ((), (), ())),
-        sac,
+    learner = TrainState(
+        params, method_state, critic, critic, jnp.zeros(()), ((), (), ())
     )
+    return restart(start_critic(learner, critic, sac), sac)
+
+
+def start_critic(learner: TrainState, critic: Any, sac: SacSettings) -> TrainState:
+    """Gives the learner new critics."""
+    start = critic if sac.l2_init else ()
+    return learner._replace(critic=critic, critic_start=start)
 
 
 def init_critic(key: jax.Array, spec: Spec, extra: int) -> Any:
@@ -155,7 +163,11 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     inputs = method.critic_input(batch.extras, batch.observation)
     q = q_values(critic, inputs, batch.action, sac.network)
     error = q - jax.lax.stop_gradient(target)
-    return jnp.sum(jnp.mean(error**2, axis=-1)), jnp.mean(q)
+    loss = jnp.sum(jnp.mean(error**2, axis=-1))
+    if sac.l2_init:
+        away = jax.tree.map(lambda w, first: w - first, critic, learner.critic_start)
+        loss += sac.l2_init * sum(jnp.sum(w**2) for w in jax.tree.leaves(away))
+    return loss, jnp.mean(q)
 
 
 def _policy_loss(params, learner, batch, draw, method, sac):

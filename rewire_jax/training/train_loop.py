@@ -14,14 +14,21 @@ import jax.numpy as jnp
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Method, Round
-from rewire_jax.training import exploration, random_keys, replay_buffer, rollout, sac
+from rewire_jax.training import (
+    exploration,
+    plasticity,
+    random_keys,
+    replay_buffer,
+    rollout,
+    sac,
+)
 from rewire_jax.training.loop_state import (
     ChunkMetrics,
     CollectorState,
     LoopConfig,
     RunnerState,
 )
-from rewire_jax.training.random_keys import CollectKeys
+from rewire_jax.training.random_keys import CollectKeys, UpdateKeys
 
 
 def select(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -158,27 +165,35 @@ def update_from_buffer(
     size = settings.batch_size, environment.action_size
 
     def learned(learner):
-        indices_key, draw_key = jax.random.split(key)
+        keys = random_keys.named(UpdateKeys, key)
         indices = replay_buffer.sample_indices(
-            buffer, indices_key, time, (updates, size[0])
+            buffer, keys.indices, time, (updates, size[0])
         )
         draws = jax.vmap(
             lambda key, extras: sac.sample_noise(
                 key, learner.method_state, extras, size, method, settings
             )
         )(
-            jax.random.split(draw_key, updates),
+            jax.random.split(keys.draws, updates),
             replay_buffer.extras_at(buffer, indices, time),
         )
 
         def batch(number):
             return replay_buffer.take(buffer, indices[number], time, length)
 
+        def fresh_batch(key):
+            return replay_buffer.sample(buffer, key, time, size[0], length)
+
         learner, metrics = sac.updates(
             learner, draws, batch, first, updates, method, settings
         )
+        made = Round(first, first + updates, metrics)
+        if settings.redo_every:
+            learner = plasticity.redo_in_time(
+                keys.redo, learner, fresh_batch, made, method, settings
+            )
         params, method_state = method.after_round(
-            learner.params, learner.method_state, Round(first, first + updates, metrics)
+            learner.params, learner.method_state, made
         )
         return learner._replace(params=params, method_state=method_state), metrics
 
@@ -296,8 +311,11 @@ def inspect(
     method: Method,
     settings: SacSettings,
 ) -> sac.Metrics:
-    """Returns the metrics of `Method.inspect`; `length` is the episode length."""
+    """Returns metrics of the state; `length` is the episode length."""
     batch_key = random_keys.of_step(key, time).inspect
     buffer, learner = state.collection.buffer, state.learner
     batch = replay_buffer.sample(buffer, batch_key, time, settings.batch_size, length)
-    return method.inspect(learner.params, learner.method_state, batch.observation)
+    metrics = method.inspect(learner.params, learner.method_state, batch.observation)
+    if not settings.plasticity_metrics:
+        return metrics
+    return metrics | plasticity.metrics(learner, batch, method, settings)

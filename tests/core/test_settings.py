@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings, from_json, to_json, validate
+from rewire_jax.core.settings import Settings, validate
+from rewire_jax.core.settings_json import from_json, to_json
 from rewire_jax.methods.rewire_settings import RewireSettings
 from rewire_jax.training.run_setup import prepare
 from tests.tiny import tiny

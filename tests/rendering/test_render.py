@@ -14,7 +14,7 @@ from PIL import Image
 import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import to_json
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.rendering import render
 from rewire_jax.run import run_state

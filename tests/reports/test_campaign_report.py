@@ -9,7 +9,7 @@ import pytest
 from fake_run import rows, write_run
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import to_json
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.reports.campaign_report import CampaignReport, write_campaign_report
 from rewire_jax.reports.statistics import (
     normalised_iqm,

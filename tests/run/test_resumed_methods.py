@@ -2,23 +2,32 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rewire_jax.run import train_run
 from tests.stopped_run import assert_same_run, checkpoints, train_until
-from tests.tiny import tiny
+from tests.tiny import rows, tiny
+
+PLASTIC = {
+    "redo_every": 10,
+    "dormant_threshold": 0.5,
+    "l2_init": 0.01,
+    "plasticity_metrics": True,
+}
 
 
 # PackNet in the updates after its second pruning; CSP with labels in its buffer, in a
-# task that ends with a search.
+# task that ends with a search. Then what knobs of SAC need, at a task's start.
 @pytest.mark.parametrize(
-    ("method", "times", "name", "resumed"),
+    ("method", "times", "name", "resumed", "sac"),
     [
-        ("packnet", 3, "offline_update", "task-001-step-0000040"),
+        ("packnet", 3, "offline_update", "task-001-step-0000040", {}),
         pytest.param(
-            *("csp", 5, "chunk", "task-001-step-0000020"), marks=pytest.mark.slow
+            *("csp", 5, "chunk", "task-001-step-0000020", {}), marks=pytest.mark.slow
         ),
+        ("ft1", 5, "chunk", "task-001", PLASTIC),
     ],
 )
 def test_what_a_method_needs_within_a_task_is_saved(
@@ -26,12 +35,19 @@ def test_what_a_method_needs_within_a_task_is_saved(
     times: int,
     name: str,
     resumed: str,
+    sac: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=1)
+    settings = dataclasses.replace(
+        settings, sac=dataclasses.replace(settings.sac, **sac)
+    )
     whole = train_run.train(settings, tmp_path / "whole")
     train_until(monkeypatch, settings, tmp_path / "parts", times, name)
     assert checkpoints(tmp_path / "parts")[-1] == resumed
     parts = train_run.train(settings, tmp_path / "parts", resume=True)
     assert_same_run(parts, whole, settings)
+    reported = {"dormant_critic", "rank_critic", "dormant_policy", "rank_policy"}
+    for row in rows(parts, "training.jsonl"):
+        assert (reported & row.keys()) == (reported if sac else set())

@@ -11,7 +11,8 @@ import pytest
 
 import rewire_jax
 from rewire_jax import UserError
-from rewire_jax.core.settings import Settings, digest
+from rewire_jax.core.settings import Settings
+from rewire_jax.core.settings_json import digest
 from rewire_jax.run import run_state
 from rewire_jax.storage.run_folder import TABLES
 from rewire_jax.training.run_setup import prepare

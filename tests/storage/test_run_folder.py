@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rewire_jax.core.errors import UserError, writing
-from rewire_jax.core.settings import to_json
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.run import run_state
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.run_folder import HEADER, held
