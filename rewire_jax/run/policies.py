@@ -79,7 +79,9 @@ class Policies(NamedTuple):
 
         def returns(tasks: Array, playing: Array, round_: int) -> Array:
             del playing, round_  # one member: all candidates play
-            played = [[float(play(task)) for _ in range(trials)] for task in tasks]
+            played = [
+                [float(play(task)) for _ in range(trials)] for task in tasks.tolist()
+            ]
             return np.mean(played, axis=1)
 
         tasks = np.array(self.candidates(member))
