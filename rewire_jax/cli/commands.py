@@ -12,6 +12,7 @@ from typing import Annotated, get_args
 import tyro
 
 from rewire_jax.cli.campaign_command import Campaign
+from rewire_jax.cli.evaluate_command import Evaluate
 from rewire_jax.cli.flags import Flags
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.envs.scenarios import Scenario, list_scenarios, make_scenario
@@ -120,47 +121,6 @@ class Sweep(Flags):
             print(f"finished: `rewire-jax report {folder}` shows the sweep")
         else:
             print(to_terminal(write_report([folder], folder)), end="")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluate(Flags):
-    """Evaluates the trained policies of a run on its tasks, without exploration.
-
-    Attributes:
-      run: folder of the run.
-      stage: use the policies as they were after this task, counted from 0; by default
-        the latest finished task.
-      episodes: number of episodes for each task.
-      seed: seed of the episodes; it is independent of the seed of the run.
-      json: print rows as JSON instead of a table.
-    """
-
-    run: tyro.conf.Positional[Path]
-    stage: int | None = None
-    episodes: int = 128
-    seed: int = 0
-    json: bool = False
-
-    def __call__(self) -> None:
-        """Prints the returns of each seed on each task, as a table or as JSON."""
-        rows = evaluation.evaluate(
-            self.run, stage=self.stage, episodes=self.episodes, seed=self.seed
-        )
-        if self.json:
-            print("\n".join(json.dumps(row) for row in rows))
-            return
-        solved = [name for name in ("success", "success_last") if name in rows[0]]
-        heads = "".join(f"{name:>14}" for name in solved)
-        print(f"{'task':<28}{'seed':>6}{'return':>12}{'std':>10}{'steps':>10}{heads}")
-        for row in rows:
-            task = f"{row['task']} {row['name']}"
-            shares = "".join(f"{row[name]:>14.2f}" for name in solved)
-            print(
-                f"{task:<28}{row['seed']:>6}{row['return']:>12.1f}{row['std']:>10.1f}"
-                f"{row['steps']:>10}{shares}"
-            )
-        for seed in sorted({row["seed"] for row in rows if row["diverged"]}):
-            print(f"seed {seed} has diverged: its policy is from before that")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,8 @@
 """Facts about scenarios, and evaluations of runs."""
 
+import itertools
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +12,16 @@ from rewire_jax.core.settings import require
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection, Spec
-from rewire_jax.run import run_state
+from rewire_jax.run import episode_parts, run_state, task_choice
 from rewire_jax.run.run_state import saved
+from rewire_jax.run.task_choice import Choice, Trials
 from rewire_jax.storage import run_folder
-from rewire_jax.training import memory_estimate, rollout
+from rewire_jax.training import rollout
 from rewire_jax.training.presets import preset
-from rewire_jax.training.run_setup import base_size, make_spec, prepare
+from rewire_jax.training.run_setup import Plan, base_size, make_spec, prepare
 
+TaskLabel = Literal["given", "none"]
 _MOST_EPISODES = 2**20
-_others = jax.jit(jax.vmap(jax.vmap(jax.random.fold_in, (0, None)), (0, None)))
 
 
 def info(scenario: Scenario) -> dict[str, Any]:
@@ -97,9 +99,20 @@ def most_stored(
 
 
 def evaluate(
-    run: str | Path, *, stage: int | None = None, episodes: int = 128, seed: int = 0
+    run: str | Path,
+    *,
+    stage: int | None = None,
+    episodes: int = 128,
+    seed: int = 0,
+    task_label: TaskLabel = "given",
+    trials: int = 2,
+    trial_steps: int | None = None,
 ) -> list[dict[str, Any]]:
     """Evaluates a run on all its tasks, without exploration.
+
+    With task labels, each task is played by its own policy. Without, the policies of
+    all tasks trained so far are candidates. One of them is chosen by its return in
+    trials, see `halving.choose`, and plays the same episodes.
 
     Args:
       run: folder of the run.
@@ -107,19 +120,32 @@ def evaluate(
       episodes: number for each task and member; played in parts if the memory does
         not hold all of them.
       seed: seed of the episodes.
+      task_label: "given", or "none" to evaluate also without task labels.
+      trials: without labels, how often each remaining candidate plays in a round.
+      trial_steps: length of a trial, from a reset; a whole episode if None.
 
     Returns:
       A row for each member and task: task, name, seed (the member's), return, std (over
       episodes), steps (of all episodes), diverged (whether the member is no longer
       updated). If the environment defines success, also success and success_last: the
-      share of episodes solved at any step, and at the last.
+      share of episodes solved at any step, and at the last. Without labels, also
+      chosen, a dictionary with return, std, steps and success of the chosen policy; its
+      task and name (the first of them, if the policies of several tasks are equal);
+      recognised (whether it is the policy of this task, at any place in the sequence;
+      None if the task was not trained yet); candidates (the number of different
+      policies) and interactions (steps of all trials).
 
     Raises:
-      UserError: no such run or stage, or a damaged checkpoint.
+      UserError: no such run or stage, a damaged checkpoint, or an argument out of
+        range.
     """
     require(
         1 <= episodes <= _MOST_EPISODES,
         f"--episodes must be 1 to {_MOST_EPISODES}, not {episodes}",
+    )
+    require(
+        task_label in get_args(TaskLabel),
+        f"--task-label must be given or none, not {task_label}",
     )
     folder = Path(run)
     require(
@@ -129,6 +155,32 @@ def evaluate(
     )
     _, settings = saved(folder)
     plan = prepare(settings)
+    stage = run_state.latest(folder) if stage is None else stage
+    policies, active = _policies(folder, stage, plan)
+    keys = jax.random.split(jax.random.key(seed), (plan.num_slots, len(plan.names)))
+    result = episode_parts.play(plan, plan.tasks, policies, keys, episodes)
+    rows = [
+        {"task": task, "name": name, "seed": member.seed}
+        | _measured(result, place, task)
+        | {"diverged": not active[place]}
+        for place, member in enumerate(plan.members)
+        for task, name in enumerate(plan.names)
+    ]
+    if task_label == "given":
+        return rows
+    how = Trials(trials, trial_steps, seed)
+    choice = task_choice.choose(plan, policies, stage + 1, how)
+    policies = task_choice.pick(plan, policies, choice.place)
+    result = episode_parts.play(plan, plan.tasks, policies, keys, episodes)
+    places = itertools.product(range(len(plan.members)), range(len(plan.names)))
+    return [
+        row | {"chosen": _chosen(choice, plan, at) | _measured(result, *at)}
+        for row, at in zip(rows, places, strict=True)
+    ]
+
+
+def _policies(folder: Path, stage: int, plan: Plan) -> tuple[Any, np.ndarray]:
+    """Policies `[members, tasks]` after a stage; and which members did not diverge."""
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = learner.params, learner.method_state
     owner = run_state.identity(plan.settings, plan.members)
@@ -136,28 +188,27 @@ def evaluate(
     learner = plan.program.init(plan.stacked)._replace(
         params=params, method_state=method_state
     )
-    policies = plan.program.policies(plan.stacked, learner)
-    keys = jax.random.split(jax.random.key(seed), (plan.num_slots, len(plan.names)))
-    at_once = memory_estimate.episodes_at_once(plan, policies, episodes)
-    parts = []
-    for part in range(-(-episodes // at_once)):
-        rolled = plan.program.rollout(plan.tasks, policies, keys, at_once)
-        parts.append(jax.tree.map(np.asarray, rolled))
-        keys = _others(keys, part)
-    result = jax.tree.map(lambda *x: np.concatenate(x, axis=2)[..., :episodes], *parts)
-    returns, lengths = result.returns, result.lengths
+    return plan.program.policies(plan.stacked, learner), active
+
+
+def _measured(result: rollout.Rollout, place: int, task: int) -> dict[str, Any]:
+    """Means over the episodes of a member in a task."""
+    returns = result.returns[place, task]
     solved = rollout.named(result.success)
-    return [
-        {
-            "task": task,
-            "name": name,
-            "seed": member.seed,
-            "return": float(returns[place, task].mean()),
-            "std": float(returns[place, task].std()),
-            "steps": int(lengths[place, task].sum()),
-            "diverged": not active[place],
-        }
-        | {name: float(x[place, task].mean()) for name, x in solved.items()}
-        for place, member in enumerate(plan.members)
-        for task, name in enumerate(plan.names)
-    ]
+    return {
+        "return": float(returns.mean()),
+        "std": float(returns.std()),
+        "steps": int(result.lengths[place, task].sum()),
+    } | {name: float(x[place, task].mean()) for name, x in solved.items()}
+
+
+def _chosen(choice: Choice, plan: Plan, at: tuple[int, int]) -> dict[str, Any]:
+    """What was chosen by a member in a task."""
+    task = int(choice.place[at])
+    return {
+        "task": task,
+        "name": plan.names[task],
+        "recognised": bool(choice.recognised[at]) if choice.trained[at] else None,
+        "candidates": int(choice.candidates[at]),
+        "interactions": int(choice.interactions[at]),
+    }

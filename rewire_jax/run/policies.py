@@ -7,12 +7,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Spec
-from rewire_jax.run import run_state, sweep_members
+from rewire_jax.run import halving, run_state, sweep_members
+from rewire_jax.run.halving import Array
 from rewire_jax.run.run_state import saved
 from rewire_jax.run.sweep_grid import make_members
 from rewire_jax.run.sweep_members import Found
@@ -38,18 +40,52 @@ class Policies(NamedTuple):
         takes the last member for an index that is too large: see `member`.
       seeds: seeds of the members, in the same order.
       tasks: names of the sequence.
+      candidates: `member -> tasks`, the tasks trained so far; of tasks whose policies
+        are equal, the first.
     """
 
     act: Act
     members: Learned
     seeds: tuple[int, ...]
     tasks: tuple[str, ...]
+    candidates: Callable[[Learned], tuple[int, ...]]
 
     def member(self, seed: int) -> Learned:
         """The member that was trained with a seed; `UserError` if there is none."""
         require(seed in self.seeds, f"there is no seed {seed}: see `seeds`")
         place = self.seeds.index(seed)
         return jax.tree.map(lambda leaf: leaf[place], self.members)
+
+    def choose(
+        self, member: Learned, play: Callable[[int], Any], *, trials: int = 2
+    ) -> int:
+        """Chooses the policy for an unknown task, by its returns in trials of it.
+
+        See `halving.choose`; `evaluate` chooses in the same way.
+
+        Args:
+          member: the member whose policies are candidates.
+          play: `task -> return`; plays a trial of the unknown task by the policy of
+            `task`, from a reset. All trials must have the same length.
+          trials: how often each remaining candidate plays in a round.
+
+        Returns:
+          The task whose policy was chosen, for `act`.
+
+        Raises:
+          UserError: `trials` is not positive.
+        """
+        require(trials >= 1, f"trials must be positive, not {trials}")
+
+        def returns(tasks: Array, playing: Array, round_: int) -> Array:
+            del playing, round_  # one member: all candidates play
+            played = [
+                [float(play(task)) for _ in range(trials)] for task in tasks.tolist()
+            ]
+            return np.mean(played, axis=1)
+
+        tasks = np.array(self.candidates(member))
+        return int(halving.choose(returns, tasks, np.asarray(len(tasks))))
 
 
 def load_policy(
@@ -131,13 +167,18 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
     )
     header, settings, spec = _read(folder, "run")
     method = find_method(settings.method).make(spec, settings.options)
+    stage = run_state.latest(folder) if stage is None else stage
+
+    def candidates(member: Learned) -> tuple[int, ...]:
+        trained = [method.policy(*member, jnp.asarray(t)) for t in range(stage + 1)]
+        return tuple(sorted(set(halving.first_equal(trained))))
 
     members = population.of_run(settings)
     owner = run_state.identity(settings, members)
     learned = _load(Found(folder, stage, 0, settings.seeds, ()), method, owner)
     seeds = tuple(member.seed for member in members)
     act = act_function(method, spec)
-    return Policies(act, learned, seeds, tuple(header["tasks"]))
+    return Policies(act, learned, seeds, tuple(header["tasks"]), candidates)
 
 
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:

@@ -119,6 +119,11 @@ def kept(folder: Path, stage: int | None) -> Path:
     return between[0]
 
 
+def latest(folder: Path) -> int:
+    """Returns the latest finished stage; raises `UserError` if there is none."""
+    return int(kept(folder, None).name.removeprefix("task-")) - 1
+
+
 def finished(folder: Path, stage: int) -> bool:
     """Whether the checkpoint after a stage exists."""
     return (folder / _FOLDER / _name(stage + 1)).exists()

@@ -111,12 +111,13 @@ def check_sweep(plan: Plan, members: int, folder: Path) -> None:
     )
 
 
-def episodes_at_once(plan: Plan, policies: Any, episodes: int) -> int:
-    """How many of a member's episodes, in each task, the memory holds at once.
+def episodes_at_once(plan: Plan, policies: Any, rows: int, episodes: int) -> int:
+    """How many of a member's episodes, in each row, the memory holds at once.
 
     Args:
       plan: plan of the run.
-      policies: `[members, tasks]`, or shapes.
+      policies: `[members, rows]`, or shapes.
+      rows: number of policies of a member.
       episodes: how many are wanted; as many, or a part of them.
 
     Raises:
@@ -126,9 +127,7 @@ def episodes_at_once(plan: Plan, policies: Any, episodes: int) -> int:
     if room is None:
         return episodes
     count = episodes
-    while plan.num_slots * _play(plan, policies, len(plan.names), count) > (
-        _SHARE * room
-    ):
+    while plan.num_slots * _play(plan, policies, rows, count) > _SHARE * room:
         require(count > 1, "the memory is too small for an episode of each member")
         count = -(-count // 2)
     return count
@@ -142,7 +141,7 @@ def _cut(tree: Any, *shape: int, axes: int = 1) -> Any:
 
 
 def _play(plan: Plan, policies: Any, rows: int, episodes: int) -> int:
-    """Bytes for a member's policies in `rows` tasks, with `episodes` of each."""
+    """Bytes for a member's policies in `rows` rows, with `episodes` of each."""
     environment = plan.scenario.environment
     policies = map_own(lambda x: _cut(x, 1, rows, axes=2), _cut(policies, 1))
     if isinstance(environment, HostEnvironment):

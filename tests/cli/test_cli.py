@@ -74,6 +74,8 @@ def test_bad_settings(
         ("train probe/reach --out=", "--out"),
         ("report --out= x", "--out"),
         ("evaluate x --episodes 999999999999", "--episodes"),
+        ("evaluate x --task-label guessed", "--task-label"),
+        ("evaluate x --trials few", "--trials"),
         ("sweep probe/reach --out x --axis tau 1 9 --random 999999999999", "--random"),
     ],
 )
@@ -151,6 +153,21 @@ def test_evaluate(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert row["steps"] == 3 * 20
     main.main(["evaluate", str(run), "--episodes", "3"])
     assert f"{row['return']:.1f}" in capsys.readouterr().out
+
+
+def test_evaluate_without_task_labels(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", str(run), "--episodes", "3", "--task-label", "none"]
+    main.main([*words, "--json"])
+    row = json.loads(capsys.readouterr().out)
+    chosen = row["chosen"]
+    assert chosen["return"] == row["return"]
+    assert (chosen["interactions"], chosen["candidates"]) == (0, 1)
+    main.main(words)
+    assert "nothing to choose" in capsys.readouterr().out
+    assert "--trials" in fails(capsys, *words, "--trials", "0")
+    assert "--trial-steps" in fails(capsys, *words, "--trial-steps", "21")
 
 
 def test_report(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

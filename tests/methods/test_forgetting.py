@@ -14,7 +14,7 @@ import pytest
 import rewire_jax
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import TaskChange
-from rewire_jax.envs.scenarios import ScenarioSpec, make_scenario
+from rewire_jax.envs.scenarios import SCENARIOS, ScenarioSpec, make_scenario
 from rewire_jax.methods import METHODS
 from rewire_jax.reports import metrics
 from rewire_jax.run import run_state
@@ -26,7 +26,8 @@ from tests.tiny import PLAIN
 # The goal is not observed. The last is opposite the first.
 GOALS = {"northeast": (0.5, 0.5), "northwest": (-0.5, 0.5), "southwest": (-0.5, -0.5)}
 CHANGES = tuple(TaskChange(name, extra={"goal": goal}) for name, goal in GOALS.items())
-SCENARIO = make_scenario(ScenarioSpec("probe/corners", "reach", CHANGES, 1, 6400))
+SPEC = ScenarioSpec("probe/corners", "reach", CHANGES, 1, 6400)
+SCENARIO = make_scenario(SPEC)
 SEEDS = 3
 PULLED = ("ft_l2", "ewc")
 KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp")
@@ -208,6 +209,23 @@ def test_one_trace_for_all_tasks(
     assert not others & counts.keys()
     # Other methods may have played with these before.
     assert counts["episodes"] <= num_plays(method)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["ft1", "rewire", "sac_n"])
+def test_tasks_are_recognised_by_their_returns(
+    method: str, trained: Callable[[str], Trained], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(SCENARIOS, SPEC.name, SPEC)
+    played = rewire_jax.evaluate(trained(method).folder, episodes=64, task_label="none")
+    assert len(played) == SEEDS * len(GOALS)
+    for row in played:
+        chosen = row["chosen"]
+        assert chosen["recognised"]
+        assert chosen["return"] == row["return"]
+        # Two trials each of three policies, then of two; FT-1 has only one policy.
+        spent = 0 if method == "ft1" else (3 + 2) * 2 * 20
+        assert chosen["interactions"] == spent
 
 
 @pytest.mark.slow

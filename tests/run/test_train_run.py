@@ -237,6 +237,48 @@ def test_evaluate_replays_a_run(run: Path) -> None:
         assert abs(row["return"] - final[row["task"], row["seed"]]) < spread
 
 
+def test_evaluate_without_task_labels(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    labelled = rewire_jax.evaluate(run, episodes=8)
+    how = {"task_label": "none", "trials": 2, "trial_steps": 10}
+    played = rewire_jax.evaluate(run, episodes=8, **how)
+    choices = [row.pop("chosen") for row in played]
+    assert played == labelled
+    for row, chosen in zip(labelled, choices, strict=True):
+        assert chosen["recognised"] == (chosen["task"] == row["task"])
+        # The same policy plays the same episodes alike; another one does not.
+        assert (chosen["return"] == row["return"]) == chosen["recognised"]
+        assert chosen["candidates"] == 4
+        assert chosen["interactions"] == (4 + 2) * 2 * 10
+    words = ["--task-label", "none", "--trials", "2", "--trial-steps", "10"]
+    main.main(["evaluate", str(run), "--episodes", "8", *words])
+    said = capsys.readouterr().out
+    share = np.mean([chosen["recognised"] for chosen in choices])
+    assert f" {share:.0%} of the tasks" in said
+    assert said.count("yes") == sum(chosen["recognised"] for chosen in choices)
+    # After the first task, its policy is the only one.
+    first = rewire_jax.evaluate(run, episodes=8, stage=0, **how)
+    assert [row["chosen"]["recognised"] for row in first] == 2 * [True, *[None] * 3]
+    assert not any(row["chosen"]["interactions"] for row in first)
+
+
+def test_a_policy_for_an_unknown_task_is_chosen_by_its_returns(run: Path) -> None:
+    policies = rewire_jax.load_policies(run)
+    played = []
+
+    def play(task: int) -> float:
+        played.append(task)
+        return -abs(task - 2.2)
+
+    assert policies.choose(policies.member(1), play, trials=3) == 2
+    assert played == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3 + [2] * 3 + [3] * 3
+    early = rewire_jax.load_policies(run, stage=1)
+    assert early.candidates(early.member(0)) == (0, 1)
+    with pytest.raises(UserError, match="trials"):
+        policies.choose(policies.member(1), play, trials=0)
+
+
 def test_a_frozen_seed_is_marked_and_the_other_goes_on(
     run: Path,
     tmp_path: Path,

@@ -227,13 +227,13 @@ def test_episodes_are_played_in_parts_that_fit(monkeypatch: pytest.MonkeyPatch) 
     plan = prepare(tiny(method="ft1"))
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     policies = jax.eval_shape(plan.program.policies, plan.stacked, learner)
-    assert memory_estimate.episodes_at_once(plan, policies, 50) == 50
+    assert memory_estimate.episodes_at_once(plan, policies, 4, 50) == 50
     monkeypatch.setattr(memory_estimate, "machine_bytes", lambda: 1_000_000)
-    many = memory_estimate.episodes_at_once(plan, policies, 100_000)
+    many = memory_estimate.episodes_at_once(plan, policies, 4, 100_000)
     assert 1 < many < 100_000
     monkeypatch.setattr(memory_estimate, "machine_bytes", lambda: 100)
     with pytest.raises(UserError, match="memory"):
-        memory_estimate.episodes_at_once(plan, policies, 100)
+        memory_estimate.episodes_at_once(plan, policies, 4, 100)
 
 
 def test_table_of_needs_has_what_is_counted():
