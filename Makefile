@@ -1,4 +1,4 @@
-# Everything a developer runs. Needs make and Python 3.11 or newer, nothing else.
+# Everything a developer runs. Needs make and Python 3.11 to 3.13, nothing else.
 
 VENV := .venv
 PINS := constraints.txt
@@ -14,7 +14,7 @@ EXTRAS := dev
 %-bench %-bench/.installed: PINS := constraints-bench.txt
 %-bench %-bench/.installed: EXTRAS := bench,test
 # Targets that end in -latest have their own virtual environment with the newest versions
-# that pyproject.toml allows. JAX needs Python 3.12 or newer since 0.11.
+# that pyproject.toml allows. Since 0.11, JAX needs Python 3.12 or newer.
 %-latest %-latest/.installed: VENV := .venv-latest
 %-latest %-latest/.installed: PINS :=
 %-latest %-latest/.installed: PYTHONS := python3.13 python3.12 python3.11
