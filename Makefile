@@ -1,4 +1,4 @@
-# Everything a developer runs. Needs make and Python 3.11 or newer, nothing else.
+# Everything a developer runs. Needs make and Python 3.11 to 3.13, nothing else.
 
 VENV := .venv
 PINS := constraints.txt
@@ -13,9 +13,17 @@ EXTRAS := dev
 %-bench %-bench/.installed: VENV := .venv-bench
 %-bench %-bench/.installed: PINS := constraints-bench.txt
 %-bench %-bench/.installed: EXTRAS := bench,test
+# Targets that end in -latest have their own virtual environment with the newest versions
+# that pyproject.toml allows. Since 0.11, JAX needs Python 3.12 or newer.
+%-latest %-latest/.installed: VENV := .venv-latest
+%-latest %-latest/.installed: PINS :=
+%-latest %-latest/.installed: PYTHONS := python3.13 python3.12 python3.11
 
+# The first of these that runs is used.
+PYTHONS := python3.11 python3.12 python3.13
 # Deferred: Python is searched for only when a target needs it.
-PYTHON ?= $(shell command -v python3.11 || command -v python3 || echo python3)
+PYTHON ?= $(shell for python in $(PYTHONS) python3; do \
+	"$$python" -c '' 2>/dev/null && break; done; echo "$$python")
 RUN = $(VENV)/bin/python
 # A file's tests share what they train, so they stay in one process.
 WORKERS ?= -n 2 --dist loadfile
@@ -26,8 +34,8 @@ option = $(if $(strip $(2)),--$(1) $(2))
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup setup-mjx setup-bench lock lock-mjx lock-bench lint format test \
-	test-slow test-mjx test-bench bench-brax bench-cw bench-speed bench-mjx readme \
+.PHONY: help setup setup-mjx setup-bench setup-latest .venv-latest/.installed lock \
+	lock-mjx lock-bench lint format test test-slow test-mjx test-bench test-latest bench-brax bench-cw bench-speed bench-mjx readme \
 	notebooks docs clean
 
 help: ## List the commands
@@ -40,6 +48,8 @@ setup: .venv/.installed ## Create .venv with the pinned versions (does nothing i
 setup-mjx: .venv-mjx/.installed ## Create .venv-mjx, for Meta-World on MJX-Warp instead of C MuJoCo
 
 setup-bench: .venv-bench/.installed ## Create .venv-bench, with the implementations that bench-speed compares
+
+setup-latest: .venv-latest/.installed ## Create or upgrade .venv-latest, with the newest versions that are allowed
 
 # A virtual environment that can run pip is kept. Otherwise it is created again.
 define make_venv
@@ -55,10 +65,11 @@ endef
 .venv/.installed: constraints.txt
 .venv-mjx/.installed: constraints-mjx.txt
 .venv-bench/.installed: constraints-bench.txt
-.venv/.installed .venv-mjx/.installed .venv-bench/.installed: pyproject.toml
+.venv/.installed .venv-mjx/.installed .venv-bench/.installed .venv-latest/.installed: \
+		pyproject.toml
 	$(make_venv)
 	$(RUN) -m pip install --quiet --disable-pip-version-check \
-		-c $(PINS) -e '.[$(EXTRAS)]'
+		$(if $(PINS),-c $(PINS),--upgrade --upgrade-strategy eager) -e '.[$(EXTRAS)]'
 	@touch $@
 
 # Keeps existing pins; `make lock UPGRADE=1` looks for newer versions.
@@ -106,6 +117,10 @@ test-mjx: setup-mjx ## Run the tests of Meta-World on MJX-Warp (the first run co
 
 test-bench: setup-bench ## Run the tests of the implementations that bench-speed compares
 	$(RUN) -m pytest tests/experiments/test_bench_peers.py
+
+test-latest: setup-latest ## Run all tests except the slow ones with the newest versions that are allowed
+	$(RUN) -m pytest -m 'not slow' $(WORKERS)
+	$(RUN) -m pytest -m slow tests/docs/test_packaging.py
 
 bench_options = $(strip \
 	$(call option,scenario,$(SCENARIO)) \

@@ -1,5 +1,6 @@
 """The package as people get it: built, installed elsewhere, resolved, imported."""
 
+import dataclasses
 import json
 import os
 import re
@@ -161,5 +162,29 @@ def test_what_is_asked_for_can_be_installed_together(
         item["metadata"]["name"].lower().replace("_", "-"): item["metadata"]["version"]
         for item in json.loads(plan.read_text())["install"]
     }
-    for name, version in {"jax": "0.10", "brax": "0.14", **expected}.items():
+    jax = "0.12" if sys.version_info >= (3, 12) else "0.10"
+    for name, version in {"jax": jax, "brax": "0.14", **expected}.items():
         assert found[name].startswith(version)
+
+
+@pytest.mark.slow
+def test_the_newest_brax_trains_and_refuses_v1(tmp_path: Path) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (brax,) = (name for name in project["dependencies"] if name.startswith("brax"))
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps"]
+    newest = tmp_path / "newest"
+    run(*pip, "--target", newest, brax)
+    paths = f"{newest}{os.pathsep}{ROOT}"
+    there = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": paths}}
+    settings = flags(dataclasses.replace(tiny(method="ft1"), tasks=1, seeds=1))
+    command = [sys.executable, "-m", "rewire_jax.cli.main"]
+    train = [*command, "train", "halfcheetah/forgetting", *settings]
+    run(*train, "--backend", "positional", "--out", "run", **there)
+    header = json.loads((tmp_path / "run" / "settings.json").read_text())
+    assert header["provenance"]["versions"]["brax"].startswith("0.14")
+    refused = subprocess.run(
+        [*train, "--out", "refused"], capture_output=True, text=True, **there
+    )
+    assert refused.returncode != 0
+    assert len(refused.stderr.splitlines()) == 1
+    assert "--backend" in refused.stderr
