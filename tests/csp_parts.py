@@ -8,8 +8,9 @@ import numpy as np
 
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods import csp
-from rewire_jax.methods.base import Selection, Spec
+from rewire_jax.methods.base import Selection
 from rewire_jax.methods.csp_settings import CspSettings
+from rewire_jax.methods.spec import Spec
 
 OBSERVATIONS, ACTIONS, TASKS = 3, 2, 4
 SPEC = Spec(OBSERVATIONS, ACTIONS, hidden=5, depth=2, tasks=TASKS)

@@ -5,7 +5,7 @@ import dataclasses
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 from rewire_jax.training import compiled_functions as compiled
 from rewire_jax.training import loop_state, population
 from rewire_jax.training.member_functions import MemberFunctions

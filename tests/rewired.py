@@ -5,9 +5,10 @@ import functools
 import jax
 import numpy as np
 
-from rewire_jax.methods.base import Selection, Spec
+from rewire_jax.methods.base import Selection
 from rewire_jax.methods.rewire import rewire
 from rewire_jax.methods.rewire_settings import RewireSettings
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn.networks import Linear
 
 OBSERVATIONS, ACTIONS, N, DEPTH, TASKS, SLOTS, K = 5, 2, 12, 2, 6, 3, 3

@@ -5,7 +5,7 @@ from itertools import pairwise
 import jax
 
 from experiments.speed.timing import Loop
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 
 SQUARE = [(256, 256, 256)]
 Products = list[tuple[int, int, int]]

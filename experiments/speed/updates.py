@@ -13,7 +13,7 @@ from experiments.suite import Row, show
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 from rewire_jax.training import sac
 from rewire_jax.training.run_setup import prepare
 

@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.core.settings import Network, SacSettings
+from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
 
 Params = Any
@@ -22,34 +22,6 @@ Policy = Any
 CandidateScore = Literal["episode", "since_reset"]
 Purpose = Literal["act", "critic", "policy"]
 """The use of a context: an acting step, or an update of the critics or the policy."""
-
-
-class Spec(NamedTuple):
-    """Sizes and the network from which a method builds its policies; all static.
-
-    Attributes:
-      observations: length of an observation.
-      actions: length of an action.
-      hidden: neurons in each hidden layer.
-      depth: number of hidden layers.
-      tasks: length of the task sequence.
-      network: see `SacSettings`. `networks.policy_of` gives the plain policy of a
-        network, `networks.ACTIVATIONS` what is between two layers.
-      updates: SAC updates in a task.
-    """
-
-    observations: int
-    actions: int
-    hidden: int
-    depth: int
-    tasks: int
-    network: Network = "mlp"
-    updates: int = 1
-
-    def sizes(self, width: int = 0) -> list[int]:
-        """Layer sizes of a plain policy, one MLP; `width` 0 means `hidden` neurons."""
-        hidden = [width or self.hidden] * self.depth
-        return [self.observations, *hidden, 2 * self.actions]
 
 
 class Round(NamedTuple):
@@ -88,30 +60,6 @@ class Candidates(NamedTuple):
 
     policies: Policy
     valid: jax.Array
-
-
-class Shared(NamedTuple):
-    """A part that all of a member's policies have in common; it is stored once."""
-
-    value: Any
-
-
-def map_own(function: Callable[[jax.Array], Any], policies: Any) -> Any:
-    """Maps a function over the arrays of stacked policies, except `Shared` parts."""
-    return jax.tree.map(
-        lambda x: x if isinstance(x, Shared) else function(x), policies, is_leaf=_shared
-    )
-
-
-def axes(policies: Any) -> Any:
-    """Returns the `vmap` axes of stacked policies: None for `Shared` parts, else 0."""
-    return jax.tree.map(
-        lambda x: None if isinstance(x, Shared) else 0, policies, is_leaf=_shared
-    )
-
-
-def _shared(part: Any) -> bool:
-    return isinstance(part, Shared)
 
 
 class Selection(NamedTuple):

@@ -12,7 +12,8 @@ import optax
 from rewire_jax.core.pytrees import at, count
 from rewire_jax.core.settings import require, settings
 from rewire_jax.methods import cloning
-from rewire_jax.methods.base import Candidates, Method, Spec
+from rewire_jax.methods.base import Candidates, Method
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 

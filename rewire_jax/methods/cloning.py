@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import count
-from rewire_jax.methods.base import Spec
 from rewire_jax.methods.rewire_losses import Gaussian, gaussian_kl
+from rewire_jax.methods.spec import Spec
 
 BATCH = 128
 """Stored states in one update, as in Continual World's replay methods."""

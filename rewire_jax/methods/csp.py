@@ -17,10 +17,10 @@ from rewire_jax.methods.base import (
     Policy,
     Purpose,
     Selection,
-    Spec,
     Tools,
 )
 from rewire_jax.methods.csp_settings import CspSettings
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import settings
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 
 

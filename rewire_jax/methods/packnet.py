@@ -10,7 +10,8 @@ from jax.typing import ArrayLike
 
 from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import require, settings, static
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 
 FREE = -1

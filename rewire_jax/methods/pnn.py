@@ -21,7 +21,9 @@ import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import require, settings
-from rewire_jax.methods.base import Act, Method, Shared, Spec
+from rewire_jax.methods.base import Act, Method
+from rewire_jax.methods.shared import Shared
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 

@@ -13,9 +13,10 @@ from rewire_jax.methods import (
     regularization,
     rewire_settings,
 )
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
 from rewire_jax.methods.csp import csp
 from rewire_jax.methods.rewire import rewire
+from rewire_jax.methods.spec import Spec
 
 
 class Entry(NamedTuple):

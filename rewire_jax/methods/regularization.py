@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import require, settings
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
 from rewire_jax.methods.finetune import FinetuneSettings, ft1
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 

@@ -19,12 +19,12 @@ from rewire_jax.methods.base import (
     Purpose,
     Round,
     Selection,
-    Spec,
 )
 from rewire_jax.methods.rewire_cloning import with_cloning
 from rewire_jax.methods.rewire_losses import Gaussian, distillation_loss, gaussian_kl
 from rewire_jax.methods.rewire_settings import DISTILLED_STATES, RewireSettings
 from rewire_jax.methods.rewire_state import Context, Design, Params, State
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.wired_layers import wired
 

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.methods import wiring
-from rewire_jax.methods.base import Spec
 from rewire_jax.methods.rewire_settings import RewireSettings
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn.networks import Linear
 
 

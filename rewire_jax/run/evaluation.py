@@ -11,7 +11,8 @@ import numpy as np
 from rewire_jax.core.settings import require
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import METHODS, find_method
-from rewire_jax.methods.base import Selection, Spec
+from rewire_jax.methods.base import Selection
+from rewire_jax.methods.spec import Spec
 from rewire_jax.run import episode_parts, run_state, task_choice
 from rewire_jax.run.run_state import saved
 from rewire_jax.run.task_choice import Choice, Trials

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from rewire_jax.methods.base import Shared
+from rewire_jax.methods.shared import Shared
 
 Array = NDArray[Any]
 Play = Callable[[Array, Array, int], Array]

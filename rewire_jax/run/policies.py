@@ -12,7 +12,8 @@ import numpy as np
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
+from rewire_jax.methods.spec import Spec
 from rewire_jax.run import halving, run_state, sweep_members
 from rewire_jax.run.halving import Array
 from rewire_jax.run.run_state import saved

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.settings import require
-from rewire_jax.methods.base import map_own
+from rewire_jax.methods.shared import map_own
 from rewire_jax.run import episode_parts, halving
 from rewire_jax.run.halving import Array
 from rewire_jax.training import population

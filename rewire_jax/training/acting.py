@@ -7,7 +7,8 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.methods.base import Method, Policy, Spec
+from rewire_jax.methods.base import Method, Policy
+from rewire_jax.methods.spec import Spec
 
 
 class Learned(NamedTuple):

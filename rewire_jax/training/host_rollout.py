@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rewire_jax.envs.base import HostEnvironment, Task
 from rewire_jax.envs.vector_env import VectorEnv, draw_seed, open_lanes, shown
-from rewire_jax.methods.base import map_own
+from rewire_jax.methods.shared import map_own
 from rewire_jax.training.rollout import Rollout, Success
 
 Array = NDArray[Any]

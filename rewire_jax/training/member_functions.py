@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Candidates, Method, Selection, Spec, Tools, axes
+from rewire_jax.methods.base import Candidates, Method, Selection, Tools
+from rewire_jax.methods.shared import axes
+from rewire_jax.methods.spec import Spec
 from rewire_jax.training import random_keys, replay_buffer, rollout, sac, train_loop
 from rewire_jax.training.loop_state import (
     ChunkMetrics,

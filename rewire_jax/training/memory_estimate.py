@@ -24,7 +24,7 @@ from rewire_jax.core.machine_memory import machine_bytes
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import map_own
+from rewire_jax.methods.shared import map_own
 from rewire_jax.training import colored_noise, rollout, train_loop
 from rewire_jax.training.run_setup import Plan
 from rewire_jax.training.time_estimate import least_hours

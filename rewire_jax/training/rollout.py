@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.envs.base import Environment, HostEnvironment, State, Task, check_state
-from rewire_jax.methods.base import axes
+from rewire_jax.methods.shared import axes
 
 
 class Success(NamedTuple):

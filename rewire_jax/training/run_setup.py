@@ -13,7 +13,7 @@ from rewire_jax.core.settings import Settings, flag, require, validate
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.scenarios import Scenario, make_scenario
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training import compiled_functions, population
 from rewire_jax.training.compiled_functions import Program

@@ -10,7 +10,8 @@ import optax
 
 from rewire_jax.core.settings import Network, SacSettings
 from rewire_jax.core.transition import Batch
-from rewire_jax.methods.base import Method, MethodState, Params, Spec
+from rewire_jax.methods.base import Method, MethodState, Params
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 
 Metrics = dict[str, jax.Array]

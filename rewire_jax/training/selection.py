@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.methods.base import map_own
+from rewire_jax.methods.shared import map_own
 from rewire_jax.training.rollout import Rollout
 
 

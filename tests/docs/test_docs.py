@@ -74,7 +74,7 @@ def test_every_setting_of_every_method_is_told(site, capsys) -> None:
 def test_the_whole_public_face_is_told(site) -> None:
     for name in rewire_jax.__all__:
         assert f'id="rewire_jax.{name}"' in site["api"]
-    for name in ("base.Method", "base.Spec", "wiring.refine"):
+    for name in ("base.Method", "spec.Spec", "wiring.refine"):
         assert f'id="rewire_jax.methods.{name}"' in site["api"]
     assert 'id="rewire_jax.envs.base.Environment"' in site["api"]
 

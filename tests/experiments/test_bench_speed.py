@@ -13,7 +13,7 @@ from experiments.speed.products import multiply_adds, products
 from experiments.speed.timing import Timing, in_turn
 from experiments.speed.updates import updates
 from rewire_jax.core.errors import UserError
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 from rewire_jax.storage import run_folder
 from rewire_jax.training.run_setup import prepare
 

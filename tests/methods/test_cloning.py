@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rewire_jax.methods import cloning
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 
 SPEC = Spec(observations=3, actions=2, hidden=5, depth=2, tasks=4)
 KEY = jax.random.key(0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rewire_jax.methods import finetune
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 
 SPEC = Spec(observations=3, actions=2, hidden=5, depth=2, tasks=3)
 NUMBERS = (3 * 5 + 5) + (5 * 5 + 5) + (5 * 4 + 4)

@@ -15,7 +15,8 @@ import rewire_jax
 from rewire_jax.core.settings import Network
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import METHODS, find_method, wiring
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training.acting import act_function
 from tests.tiny import tiny

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import pytest
 
 from rewire_jax.methods import METHODS, Entry
-from rewire_jax.methods.base import Method, Spec
+from rewire_jax.methods.base import Method
 from rewire_jax.methods.regularization import FtL2Settings
 from rewire_jax.methods.rewire import rewire
 from rewire_jax.methods.rewire_settings import RewireSettings
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
 from rewire_jax.nn.permutation import permute

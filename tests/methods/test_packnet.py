@@ -9,8 +9,8 @@ import pytest
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.methods import packnet
-from rewire_jax.methods.base import Spec
 from rewire_jax.methods.packnet import FREE, PackNetSettings
+from rewire_jax.methods.spec import Spec
 
 SPEC = Spec(observations=3, actions=2, hidden=5, depth=2, tasks=4)
 KEY = jax.random.key(0)

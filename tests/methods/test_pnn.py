@@ -9,8 +9,9 @@ import pytest
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import pnn
-from rewire_jax.methods.base import Spec, map_own
 from rewire_jax.methods.pnn import PnnSettings
+from rewire_jax.methods.shared import map_own
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training import rollout
 from rewire_jax.training.memory_estimate import size

@@ -8,8 +8,9 @@ import pytest
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods import regularization
-from rewire_jax.methods.base import Spec, Tools
+from rewire_jax.methods.base import Tools
 from rewire_jax.methods.regularization import EwcSettings, FtL2Settings, fisher_diagonal
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 
 SPEC = Spec(observations=3, actions=2, hidden=5, depth=2, tasks=3)

@@ -5,10 +5,10 @@ import pytest
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import find_method, finetune
-from rewire_jax.methods.base import Spec
 from rewire_jax.methods.rewire import rewire
 from rewire_jax.methods.rewire_settings import RewireSettings
 from rewire_jax.methods.rewire_state import Context
+from rewire_jax.methods.spec import Spec
 from tests.rewired import (
     ACTIONS,
     DEPTH,

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rewire_jax.methods.base import Shared
+from rewire_jax.methods.shared import Shared
 from rewire_jax.run import halving
 
 NAN = float("nan")

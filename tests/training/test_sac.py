@@ -8,7 +8,7 @@ import pytest
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training import replay_buffer, sac
 

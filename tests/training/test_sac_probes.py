@@ -11,7 +11,7 @@ from rewire_jax.core.settings import SacSettings
 from rewire_jax.envs import probe
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Spec
+from rewire_jax.methods.spec import Spec
 from rewire_jax.training import loop_state, replay_buffer, rollout, sac, train_loop
 
 # Probes with one-number observations and actions, learned side by side.
