@@ -5,9 +5,8 @@ task-000/            the first task
   batches.json       which members are trained on it together
   batch-000/         their tables and checkpoints, as a run's (see `run_folder`)
 
-All members are trained on a task, in batches that fit the memory, before the next task
-starts. So the worst members can be dropped between tasks (successive halving, Jamieson
-and Talwalkar 2016).
+All members are trained on a task, in batches that fit the memory, before the next one.
+So the worst can be dropped between tasks (halving, Jamieson and Talwalkar 2016).
 """
 
 import math
