@@ -19,8 +19,8 @@ CriticEntropy = Literal["sample", "batch_mean"]
 """The entropy in a critic's target: of each action, or the mean over the batch."""
 PolicyStates = Literal["current", "both"]
 """States in the policy's losses: the first of each transition, or both."""
-Network = Literal["mlp", "layer_norm"]
-"""Networks of policy and critics: plain, or with normalised hidden layers."""
+Network = Literal["mlp", "layer_norm", "residual"]
+"""Networks of policy and critics: plain, with normalised hidden layers, or residual."""
 
 
 def traced(default: int) -> Any:
@@ -83,7 +83,9 @@ class SacSettings:
       depth: hidden layers of the policy and of each critic.
       network: networks of the policy and of both critics: "mlp" as in the paper;
         "layer_norm" also normalises each hidden layer's output over its neurons before
-        the activation, to mean 0 and variance 1, without learned scale and offset.
+        the activation, to mean 0 and variance 1, without learned scale and offset;
+        "residual" also adds to each hidden layer, except the first, the hidden layer
+        before it. `rewire` then needs `--alignment off`.
       batch_size: transitions in one update.
       policy_delay: critic updates for each update of policy and temperature.
       target_delay: critic updates for each update of the targets.
@@ -297,6 +299,11 @@ def validate(run: Settings) -> None:
         run.interactions >= run.warmup + run.envs * run.update_every,
         f"--interactions {run.interactions} leaves no update after --warmup "
         f"{run.warmup}: raise --interactions or lower --warmup",
+    )
+    require(
+        run.sac.network != "residual" or not run.sac.redo_every,
+        "--redo-every resets no neurons of --network residual, where their outputs "
+        "reach all later layers: drop one of them",
     )
     require(
         run.buffer >= run.envs,

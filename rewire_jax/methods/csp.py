@@ -163,9 +163,10 @@ def distribution(
     """Mean and log-std of the weighted policies; gradients reach the newest anchor."""
     activation = networks.ACTIVATIONS[design.spec.network]
     newest = context[..., state.frozen, None]
-    x = observation
+    x, below = observation, None
     for index, layer in enumerate(params):
-        x = activation(x) if index else x
+        if index:
+            x = below = networks.between(activation, x, below)
         # A layer is linear in its parameters, so its outputs can be mixed.
         frozen = state.anchors[index]
         outputs = jnp.einsum("...i,aoi->...ao", x, frozen.weight) + frozen.bias

@@ -10,7 +10,8 @@ whole sequence: the activations of columns that do not come before are zeros, so
 their part of V neither matters nor learns.
 
 With `--network layer_norm`, each column normalises its hidden layers' x_i. The inner
-layers V are not normalised, which would cancel the scale a.
+layers V are not normalised, which would cancel the scale a. With `--network residual`
+it also adds its own h_{i-1} to h_i.
 """
 
 import functools
@@ -188,7 +189,7 @@ def play(
     column: Column,
     place: jax.Array,
     observation: jax.Array,
-    activation: networks.Activation,
+    activation: networks.Activation | networks.Residual,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std of a column, each `[..., actions]`; see `run_columns`."""
     arguments = columns, column, place, observation, activation
@@ -200,7 +201,7 @@ def run_columns(
     column: Column,
     place: jax.Array,
     observation: jax.Array,
-    activation: networks.Activation,
+    activation: networks.Activation | networks.Residual,
 ) -> tuple[list[jax.Array], jax.Array]:
     """`run_column`, and what comes before; gradients flow only into this column.
 
@@ -238,7 +239,7 @@ def run_column(
     place: jax.Array,
     earlier: list[jax.Array],
     observation: jax.Array,
-    activation: networks.Activation,
+    activation: networks.Activation | networks.Residual,
 ) -> tuple[list[jax.Array], jax.Array]:
     """A column's hidden activations and output.
 
@@ -255,9 +256,9 @@ def run_column(
     """
     first, *layers = column.layers
     x = networks.affine(first, observation)
-    hidden = []
+    hidden: list[jax.Array] = []
     for layer, lateral, below in zip(layers, column.laterals, earlier, strict=True):
-        x = activation(x)
+        x = networks.between(activation, x, hidden[-1] if hidden else None)
         hidden.append(x)
         inner = networks.activate((lateral.scale * below) @ lateral.inner.T)
         side = networks.affine(lateral.outer, inner)

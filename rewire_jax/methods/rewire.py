@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
+from rewire_jax.core.settings import require
 from rewire_jax.methods import rewire_alignment as alignment
 from rewire_jax.methods import wiring
 from rewire_jax.methods.base import (
@@ -32,7 +33,16 @@ Metrics = dict[str, jax.Array]
 
 
 def rewire(spec: Spec, options: RewireSettings) -> Method:
-    """The method of the paper."""
+    """The method of the paper.
+
+    Raises:
+      UserError: the network does not fit the alignment.
+    """
+    require(
+        spec.network != "residual" or options.alignment == "off",
+        "--network residual: its neurons have fixed places, so wirings cannot be "
+        "refined; add --alignment off",
+    )
     slots = min(options.head_slots, spec.tasks)
     design = Design(
         spec=spec,
@@ -127,14 +137,14 @@ def forward(
 ) -> Gaussian:
     """Returns the wired policy of a mode with `scores` `[L, n]` (Eq. 2)."""
     activation = networks.ACTIVATIONS[design.spec.network]
-    x = observation
+    x, below = observation, None
     for layer, v in zip(params.hidden, scores, strict=True):
         key, drop_key = jax.random.split(key)
         x = wired(layer, v, design.options.tau, x)
         # The authors drop out before the permutation. Only the variance of the scores'
         # gradient differs.
         x = _dropout(drop_key, x, design.options.dropout)
-        x = activation(x)
+        x = below = networks.between(activation, x, below)
     head = at(params.heads, design.head_slot(state))
     return networks.gaussian(networks.affine(head, x))
 

@@ -15,7 +15,8 @@ class Spec(NamedTuple):
       depth: number of hidden layers.
       tasks: length of the task sequence.
       network: see `SacSettings`. `networks.policy_of` gives the plain policy of a
-        network, `networks.ACTIVATIONS` what is between two layers.
+        network; `networks.ACTIVATIONS` what is between two layers, for
+        `networks.between`.
       updates: SAC updates in a task.
     """
 

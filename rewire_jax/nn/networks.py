@@ -5,12 +5,16 @@ prune them layer by layer. `MLP` is the Flax module of the same network;
 `as_variables` and `as_layers` rename one form into the other without a copy.
 
 The networks of `ACTIVATIONS` differ only in what is between two layers. It has no
-parameters, so the stored form is the same. It treats all neurons alike, so the order of
-a hidden layer's neurons does not matter: permuting the rows of its weight and bias, and
-the columns of the next layer's weight, leaves the output as it is. So a rewired network
-is an ordinary one with either of them.
+parameters, so the stored form is the same. A rewired network is an ordinary one with
+each of them: reordering a layer's output is reordering its rows.
+
+"mlp" and "layer_norm" treat all neurons alike, so the order of a hidden layer's neurons
+does not matter: permuting the rows of its weight and bias, and the columns of the next
+layer's weight, leaves the output as it is. With "residual" it matters, because a neuron
+is added to the one in its place in the layer before.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -50,6 +54,33 @@ Activation = Callable[[jax.Array], jax.Array]
 """What is between two layers, `[..., neurons]` -> `[..., neurons]`."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Residual:
+    """An activation that is added to the hidden layer before.
+
+    Attributes:
+      activation: of x, without what it is added to.
+    """
+
+    activation: Activation
+
+
+def between(
+    activation: Activation | Residual, x: jax.Array, below: jax.Array | None
+) -> jax.Array:
+    """A hidden layer's activations `[..., neurons]`.
+
+    Args:
+      activation: what is between two layers.
+      x: `[..., neurons]`, output of the layer.
+      below: activations of the hidden layer before, None for the first one.
+    """
+    if not isinstance(activation, Residual):
+        return activation(x)
+    x = activation.activation(x)
+    return x if below is None else below + x
+
+
 def activate(x: jax.Array) -> jax.Array:
     """LeakyReLU with slope 0.2, as in all networks of the paper's experiments."""
     return jax.nn.leaky_relu(x, 0.2)
@@ -65,9 +96,10 @@ def normalize_and_activate(x: jax.Array) -> jax.Array:
     return activate(jax.nn.standardize(x, variance=variance, epsilon=1e-6))
 
 
-ACTIVATIONS: Mapping[str, Activation] = {
+ACTIVATIONS: Mapping[str, Activation | Residual] = {
     "mlp": activate,
     "layer_norm": normalize_and_activate,
+    "residual": Residual(normalize_and_activate),
 }
 """By the names of `SacSettings.network`."""
 
@@ -146,15 +178,17 @@ class MLP(nn.Module):
     """
 
     features: Sequence[int]
-    activation: Activation = activate
+    activation: Activation | Residual = activate
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """`[..., inputs]` -> `[..., features[-1]]`; errors as of `Dense`."""
+        below = None
         for index, (size, key) in enumerate(
             zip(self.features, self._keys(), strict=True)
         ):
-            x = self.activation(x) if index else x
+            if index:
+                x = below = between(self.activation, x, below)
             x = Dense(size, key, name=_name(index))(x)
         return x
 
@@ -190,7 +224,7 @@ def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
 
 
 def mlp(
-    layers: Sequence[Linear], x: jax.Array, activation: Activation = activate
+    layers: Sequence[Linear], x: jax.Array, activation: Activation | Residual = activate
 ) -> jax.Array:
     """Applies the `MLP` with these layers, `[..., inputs]` -> `[..., outputs]`."""
     network = MLP([layer.bias.shape[-1] for layer in layers], activation)
@@ -199,12 +233,13 @@ def mlp(
 
 
 def hidden_activations(
-    layers: Sequence[Linear], x: jax.Array, activation: Activation = activate
+    layers: Sequence[Linear], x: jax.Array, activation: Activation | Residual = activate
 ) -> list[jax.Array]:
     """Activations `[..., neurons]` of each hidden layer of the `MLP`."""
-    activations = []
+    activations: list[jax.Array] = []
     for layer in layers[:-1]:
-        x = activation(affine(layer, x))
+        below = activations[-1] if activations else None
+        x = between(activation, affine(layer, x), below)
         activations.append(x)
     return activations
 
@@ -221,7 +256,9 @@ def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def mlp_policy(
-    layers: Sequence[Linear], observation: jax.Array, activation: Activation = activate
+    layers: Sequence[Linear],
+    observation: jax.Array,
+    activation: Activation | Residual = activate,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std, each `[..., actions]`, of a plain MLP policy."""
     return gaussian(mlp(layers, observation, activation))

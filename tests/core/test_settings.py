@@ -52,6 +52,14 @@ def test_a_value_of_another_kind_is_named(name: str, value: Any, says: str) -> N
         from_json(saved, RewireSettings)
 
 
+def test_no_neurons_of_a_residual_network_are_reset() -> None:
+    settings = changed("network", "residual")
+    validate(settings)
+    sac = dataclasses.replace(settings.sac, redo_every=100)
+    with pytest.raises(UserError, match="--redo-every"):
+        validate(dataclasses.replace(settings, sac=sac))
+
+
 def test_numbers_of_numpy_are_numbers() -> None:
     validate(changed("discount", np.float32(0.9)))
     validate(changed("envs", np.int64(16)))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import rewire_jax
+from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Network
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import METHODS, find_method, wiring
@@ -19,6 +20,7 @@ from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training.acting import act_function
+from rewire_jax.training.run_setup import prepare
 from tests.tiny import tiny
 
 SPEC = Spec(observations=3, actions=2, hidden=8, depth=2, tasks=3)
@@ -30,7 +32,10 @@ NETWORKS = typing.get_args(Network)
 def make(name: str, network: str) -> Method:
     quick = rewire_jax.preset(make_scenario("probe/reach"), name, "quick")
     spec = SPEC._replace(network=network)
-    return find_method(name).make(spec, quick.options.checked())
+    options = quick.options.checked()
+    if name == "rewire" and network == "residual":
+        options = dataclasses.replace(options, alignment="off")
+    return find_method(name).make(spec, options)
 
 
 def played(method: Method, params: Any, state: Any) -> Any:
@@ -65,8 +70,18 @@ def test_evaluations_share_what_is_compiled(name: str) -> None:
     assert len(set(acts.values())) == len(NETWORKS)
 
 
-def test_a_wired_network_is_a_plain_one() -> None:
-    method = make("rewire", "layer_norm")
+def test_rewire_aligns_no_residual_network() -> None:
+    settings = tiny()
+    sac = dataclasses.replace(settings.sac, network="residual")
+    with pytest.raises(UserError, match="--alignment off"):
+        prepare(dataclasses.replace(settings, sac=sac))
+    options = dataclasses.replace(settings.options, alignment="off")
+    prepare(dataclasses.replace(settings, sac=sac, options=options))
+
+
+@pytest.mark.parametrize("network", ["layer_norm", "residual"])
+def test_a_wired_network_is_a_plain_one(network: str) -> None:
+    method = make("rewire", network)
     params, state = method.init(KEY)
     scores = jax.random.uniform(KEY, params.scores.shape)
     context = method.context(KEY, state, "act", ())

@@ -153,9 +153,10 @@ def test_fisher_is_the_closed_form_of_each_output(layers):
     assert 0 < np.mean(clamped) < 1
 
 
-def test_fisher_of_normalized_layers():
+@pytest.mark.parametrize("network", ["layer_norm", "residual"])
+def test_fisher_of_normalized_layers(network):
     layers, observation = POLICIES["inside"], states(1)
-    activation = networks.ACTIVATIONS["layer_norm"]
+    activation = networks.ACTIVATIONS[network]
     got = jax.jit(fisher_diagonal, static_argnums=2)(layers, observation, activation)
     expected = brute_force(layers, observation, activation)
     assert_near(got, expected, rtol=1e-4, atol=1e-6)

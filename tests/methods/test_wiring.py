@@ -144,16 +144,22 @@ def realigned(rng, depth):
     return previous, tuple(hidden), jax.tree.map(jnp.asarray, adapters)
 
 
-def play(hidden, head, orders, observation):
+def play(hidden, head, orders, observation, network):
     """A wired policy in numpy, Eq. 2 and 3."""
     x = observation
     for (weight, bias), z in zip(hidden, orders, strict=True):
-        x = leaky((x @ weight.T + bias)[:, z])
+        x = (x @ weight.T + bias)[:, z]
+        if network == "layer_norm":
+            x = (x.T - x.mean(axis=1)).T
+            x = (x.T / np.sqrt((x**2).mean(axis=1) + 1e-6)).T
+        x = leaky(x)
     return x @ head.weight.T + head.bias
 
 
-@pytest.mark.parametrize("depth", [1, 2, 3])
-def test_exact_recovery(depth, double):
+@pytest.mark.parametrize(
+    ("depth", "network"), [(1, "mlp"), (2, "layer_norm"), (3, "mlp"), (3, "layer_norm")]
+)
+def test_exact_recovery(depth, network, double):
     rng = np.random.default_rng([3, depth])
     previous, hidden, adapters = realigned(rng, depth)
     head = make_layers(rng, [N, OUTPUTS])[0]
@@ -163,17 +169,17 @@ def test_exact_recovery(depth, double):
     refined = np.asarray(wiring.refine(jnp.asarray(orders), adapters))
     assert refined.dtype == orders.dtype
     for cached, now in zip(orders, refined, strict=True):
-        before = play(previous, head, cached, observation)
-        after = play(hidden, head, now, observation)
+        before = play(previous, head, cached, observation, network)
+        after = play(hidden, head, now, observation, network)
         np.testing.assert_allclose(after, before, rtol=1e-12, atol=1e-13)
         # The test can fail: it does without refinement.
-        stale = play(hidden, head, cached, observation)
+        stale = play(hidden, head, cached, observation, network)
         assert np.max(np.abs(stale - before)) > 0.1
 
     # The same through the functions that policies are made of.
     folded = [*wiring.fold(hidden, refined[1]), head]
-    got = networks.mlp(folded, observation)
-    expected = play(previous, head, orders[1], observation)
+    got = networks.mlp(folded, observation, networks.ACTIVATIONS[network])
+    expected = play(previous, head, orders[1], observation, network)
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
 
     for index, layer in enumerate(wiring.adapt(previous, adapters, 0.1)):

@@ -151,7 +151,25 @@ def test_nearly_equal_neurons_are_normalized():
     assert np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("network", networks.ACTIVATIONS)
+def test_residual_adds_each_hidden_layer_to_the_next():
+    layers = networks.init_mlp(KEY, [3, 8, 8, 8, 2])
+    x = np.random.default_rng(0).normal(size=(20, 3))
+
+    def normalized(layer, x):
+        x = x @ np.asarray(layer.weight, np.float64).T + layer.bias
+        x = x - x.mean(axis=1, keepdims=True)
+        x = x / np.sqrt((x**2).mean(axis=1, keepdims=True) + 1e-6)
+        return np.where(x > 0, x, 0.2 * x)
+
+    first = normalized(layers[0], x)
+    second = first + normalized(layers[1], first)
+    third = second + normalized(layers[2], second)
+    expected = third @ layers[3].weight.T + layers[3].bias
+    got = networks.mlp(layers, jnp.asarray(x), networks.ACTIVATIONS["residual"])
+    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("network", ["mlp", "layer_norm"])
 def test_the_order_of_hidden_neurons_does_not_matter(network):
     layers = list(networks.init_mlp(KEY, [3, 8, 8, 2]))
     x = jax.random.normal(jax.random.key(1), (20, 3))
