@@ -62,9 +62,10 @@ def loss(design: Design, key: jax.Array, params: Params, state: State) -> jax.Ar
     orders = wiring.refine(state.orders, params.adapters)
 
     def policy(slot, observation):
-        x = observation
+        x, below = observation, None
         for layer, order in zip(params.hidden, orders[slot], strict=True):
-            x = activation(networks.affine(layer, x)[order])
+            x = networks.affine(layer, x)[order]
+            x = below = networks.between(activation, x, below)
         return networks.gaussian(networks.affine(at(heads, slot), x))
 
     earlier = cloning.earlier_slots(state.memory, state.learned)
