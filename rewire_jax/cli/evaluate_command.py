@@ -90,15 +90,15 @@ def _chosen(chosen: Row) -> str:
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """What the task labels are worth, in a line."""
+    """Compares both evaluations in a line."""
     choices = [row["chosen"] for row in rows]
-    if all(chosen["candidates"] == 1 for chosen in choices):
+    if all(c["candidates"] == 1 for c in choices):
         return "without task labels: all tasks have the same policy; nothing to choose"
     known = [c["recognised"] for c in choices if c["recognised"] is not None]
-    with_, without = (np.mean([row["return"] for row in x]) for x in (rows, choices))
-    spent = np.mean([chosen["interactions"] for chosen in choices])
+    labelled, chosen = (np.mean([row["return"] for row in x]) for x in (rows, choices))
+    spent = np.mean([c["interactions"] for c in choices])
     return (
         f"without task labels: {np.mean(known):.0%} of the tasks recognised, mean "
-        f"return {without:.1f} (with labels {with_:.1f}), {spent:,.0f} interactions "
+        f"return {chosen:.1f} (with labels {labelled:.1f}), {spent:,.0f} interactions "
         "for each task"
     )

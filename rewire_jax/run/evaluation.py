@@ -158,6 +158,10 @@ def evaluate(
     plan = prepare(settings)
     stage = run_state.latest(folder) if stage is None else stage
     policies, active = _policies(folder, stage, plan)
+    choice = None
+    if task_label == "none":
+        how = Trials(trials, trial_steps, seed)
+        choice = task_choice.choose(plan, policies, stage + 1, how)
     keys = jax.random.split(jax.random.key(seed), (plan.num_slots, len(plan.names)))
     result = episode_parts.play(plan, plan.tasks, policies, keys, episodes)
     rows = [
@@ -167,10 +171,8 @@ def evaluate(
         for place, member in enumerate(plan.members)
         for task, name in enumerate(plan.names)
     ]
-    if task_label == "given":
+    if choice is None:
         return rows
-    how = Trials(trials, trial_steps, seed)
-    choice = task_choice.choose(plan, policies, stage + 1, how)
     policies = task_choice.pick(plan, policies, choice.place)
     result = episode_parts.play(plan, plan.tasks, policies, keys, episodes)
     places = itertools.product(range(len(plan.members)), range(len(plan.names)))
