@@ -35,7 +35,11 @@ def changed(name: str, value: Any) -> Settings:
         ("method", ["rewire"], "--method must be a word"),
         ("discount", None, "--discount must be a number, not None"),
         ("time_limit", "never", "--time-limit must be one of terminal, bootstrap"),
-        ("alignment", "all", "--alignment must be one of norm, expanded, off"),
+        (
+            "alignment",
+            "all",
+            "--alignment must be one of norm, expanded, matching, off",
+        ),
         ("modes", 2**31, "--modes must be at most 2147483647"),
         ("depth", 10**400, r"--depth must be at most 1000, not 10{79}$"),
         ("beta", 1e39, "--beta is too large for a 32-bit float"),
