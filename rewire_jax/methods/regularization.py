@@ -210,12 +210,12 @@ def fisher_diagonal(
 
     def add_state(total, state):
         jacobians = jax.jacrev(scaled)([layer.bias for layer in layers], state)
-        diagonal, x, below = [], state, None
-        for layer, jacobian in zip(layers, jacobians, strict=True):
+        inputs = [state, *networks.hidden_activations(layers, state, activation)]
+        diagonal = []
+        for x, jacobian in zip(inputs, jacobians, strict=True):
             of_bias = jnp.sum(jacobian**2, axis=0)
             # A weight's derivatives are its bias's times the layer's input.
             diagonal.append(Linear(jnp.outer(of_bias, x**2), of_bias))
-            x = below = networks.between(activation, networks.affine(layer, x), below)
         clamped = jax.tree.map(lambda f: jnp.maximum(f, LEAST_FISHER), tuple(diagonal))
         return jax.tree.map(jnp.add, total, clamped), None
 
