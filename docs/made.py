@@ -120,7 +120,7 @@ def arguments(cls: type, besides: type | None = None) -> str:
 def prose(thing: Any) -> str:
     """A docstring up to its first section, with flags as code."""
     said = re.split(r"\n\n(?:Attributes|Raises):", inspect.getdoc(thing) or "")[0]
-    return re.sub(r"(?<![`\w-])--[a-z][a-z-]*", r"`\g<0>`", said)
+    return re.sub(r"(?<![`\w-])--[a-z][a-z0-9-]*", r"`\g<0>`", said)
 
 
 def usage(_: str) -> str:

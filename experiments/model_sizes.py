@@ -78,7 +78,7 @@ def measure(name: str) -> Iterator[dict[str, Any]]:
         yield {
             "scenario": name,
             "method": method,
-            **spec._asdict(),
+            **{n: v for n, v in spec._asdict().items() if n != "updates"},
             "plain": base_size(spec),
             "least": min(numbers),
             "most": max(numbers),

@@ -153,6 +153,11 @@ def clonex(spec: Spec, options: ClonexSettings) -> Method:
         del state
         return act(layers(params, context), observation)
 
+    def hidden(params, state, observation):
+        policy = layers(params, state.learned % slots)
+        activation = networks.ACTIVATIONS[spec.network]
+        return networks.hidden_activations(policy, observation, activation)
+
     def penalty(key, params, state, context, observation, gaussian):
         del context, observation, gaussian
         loss = cloning.loss(
@@ -201,6 +206,7 @@ def clonex(spec: Spec, options: ClonexSettings) -> Method:
         end_task=end_task,
         policy=policy,
         act=act,
+        hidden=hidden,
         size=lambda params, state: jnp.asarray(count(params)),
         stored=lambda params, state: cloning.stored(state.memory, state.learned),
     )

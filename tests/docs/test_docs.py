@@ -43,7 +43,7 @@ def flags(capsys, *arguments):
     """The flags that a command's own help tells of."""
     with pytest.raises(SystemExit):
         main.main([*arguments, "--help"])
-    told = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", capsys.readouterr().out))
+    told = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", capsys.readouterr().out))
     # A scenario goes by its place.
     told -= {"--help", "--scenario"}
     return {flag for flag in told if not flag.startswith("--no-")}

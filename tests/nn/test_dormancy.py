@@ -74,9 +74,9 @@ def test_renewed_neurons_and_no_other_numbers_change():
 @pytest.mark.parametrize("network", networks.ACTIVATIONS)
 def test_hidden_activations_lead_to_the_output(network):
     activation = networks.ACTIVATIONS[network]
-    layers = networks.init_mlp(jax.random.key(0), [3, 5, 4, 2])
+    layers = networks.init_mlp(jax.random.key(0), [3, 5, 5, 2])
     x = RANDOM.normal(size=(6, 3)).astype(np.float32)
     hidden = networks.hidden_activations(layers, x, activation)
-    assert [each.shape for each in hidden] == [(6, 5), (6, 4)]
+    assert [each.shape for each in hidden] == [(6, 5), (6, 5)]
     output = networks.affine(layers[-1], hidden[-1])
     np.testing.assert_allclose(output, networks.mlp(layers, x, activation), rtol=1e-4)

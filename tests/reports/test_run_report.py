@@ -74,7 +74,7 @@ def test_stored_states_have_a_column_only_where_there_are_some(tmp_path: Path) -
     storing = write_run(tmp_path / "storing", method="clonex", stored=1.2)
     report = write_report([bare, storing], tmp_path / "both")
     for label, method, stored in (("FT-1", "ft1", 0.0), ("clonex", "clonex", 3.6)):
-        row = cells(report, label)
+        row = cells(report.page, label)
         assert (row["model size"], row["stored states"]) == ("2.25", f"{stored:.2f}")
         of = {row["method"]: row for row in rows(report.folder / "report.csv")}
         assert float(of[label]["stored_states"]) == pytest.approx(stored)
@@ -82,7 +82,7 @@ def test_stored_states_have_a_column_only_where_there_are_some(tmp_path: Path) -
         (run,) = [run for run in found if run["method"] == method]
         assert run["stored_states"] == pytest.approx(stored)
     alone = write_report([bare], tmp_path / "alone")
-    assert "stored states" not in cells(alone, "FT-1")
+    assert "stored states" not in cells(alone.page, "FT-1")
     assert "stored_states" not in rows(alone.folder / "report.csv")[0]
 
 
