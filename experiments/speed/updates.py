@@ -1,6 +1,7 @@
 """Updates a second against the machine's own rate for matrix products."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -13,11 +14,15 @@ from experiments.suite import Row, show
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods import find_method
+from rewire_jax.methods.base import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.training import sac
 from rewire_jax.training.run_setup import prepare
 
 METHODS = {"plain": "ft1", "rewire": "rewire"}
+# Of other settings than the preset's.
+Variants = dict[str, tuple[str, dict[str, Any]]]
+VARIANTS: Variants = {"matching": ("rewire", {"alignment": "matching"})}
 
 
 def draw_batches(spec: Spec, size: int) -> Batch:
@@ -67,7 +72,13 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
             draws = jax.vmap(draw)(jax.random.split(key, drawn))
             made = jnp.minimum(drawn, count - first)
             numbers = draws, batch, first, made
-            return sac.updates(learner, *numbers, method, member.sac)[0]
+            learner, metrics = sac.updates(learner, *numbers, method, member.sac)
+            params, method_state = method.after_round(
+                learner.params,
+                learner.method_state,
+                Round(first, first + drawn, metrics),
+            )
+            return learner._replace(params=params, method_state=method_state)
 
         return member, jax.lax.fori_loop(0, -(-count // drawn), several, learner)
 
@@ -100,8 +111,11 @@ def measure(effort: Effort) -> list[Row]:
     delays = (2,) if effort.quick else (2, 1)
     for delay in delays:
         sac = {"policy_delay": delay, "target_delay": delay}
-        for name, method in METHODS.items():
-            loops[f"{name}/{delay}"] = update_loop(effort.settings(method, **sac))
+        presets: Variants = {name: (method, {}) for name, method in METHODS.items()}
+        for name, (method, options) in (presets | VARIANTS).items():
+            settings = effort.settings(method, **sac)
+            changed = replace(settings.options, **options)
+            loops[f"{name}/{delay}"] = update_loop(replace(settings, options=changed))
         whole = multiply_adds(critics) + multiply_adds(policy) / delay
         needed[f"plain/{delay}"] = whole
     timings = in_turn(loops, effort.rounds, effort.seconds)
@@ -111,8 +125,9 @@ def measure(effort: Effort) -> list[Row]:
         if name in needed:
             share = timing.over(timings["square"]) * needed[name] / needed["square"]
             row |= {"multiply_adds": needed[name], "share": share}
-        if name.startswith("rewire/"):
-            row["cost"] = timings[name.replace("rewire", "plain")].over(timing)
+        kind, _, every = name.partition("/")
+        if kind in ("rewire", "matching"):
+            row["cost"] = timings[f"plain/{every}"].over(timing)
         rows.append(row)
     return rows
 
@@ -127,7 +142,8 @@ PART = Part(
     title="Updates a second, against matrix products",
     reading="`square` is a product of 256 × 256 matrices, `shapes` are all the "
     "products of a plain update in their own shapes; `plain/2` and `rewire/2` are "
-    "updates with the policy at every second one, `plain/1` and `rewire/1` at each. "
+    "updates with the policy at every second one, `plain/1` and `rewire/1` at each; "
+    "`matching` is rewire with `--alignment matching`. "
     "The share is that of the rate of `square`, the cost in plain updates.",
     measure=measure,
     columns={
