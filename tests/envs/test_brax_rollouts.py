@@ -114,6 +114,7 @@ def test_moon_slows_a_fall():
     check_free_fall("ant", "positional", 2)
 
 
+@pytest.mark.slow
 def test_a_heavy_torso_is_slower_to_move():
     assert 0.2 < push("halfcheetah", None, 4.0) / push("halfcheetah", None, 1.0) < 0.6
     # Nine equal masses, then the torso's four times that: with the momentum kept,

@@ -26,6 +26,7 @@ def reports(folder):
     return [json.loads(line) for line in lines]
 
 
+@pytest.mark.slow
 def test_figure3_of_a_real_run(tmp_path, monkeypatch):
     few = {"updates": 8, "selection_episodes": 0, "checkpoint_every": 0}
     shrink_presets(monkeypatch, hidden=32, interactions=640, **few)

@@ -103,7 +103,10 @@ def test_a_run_keeps_its_budget_and_its_policies(tmp_path):
                 np.testing.assert_array_equal(output, outputs[0])
 
 
-@pytest.mark.parametrize(("improvement", "anchors"), [(1e9, 1), (0.0, 4)])
+@pytest.mark.parametrize(
+    ("improvement", "anchors"),
+    [pytest.param(1e9, 1, marks=pytest.mark.slow), (0.0, 4)],
+)
 def test_a_run_keeps_an_anchor_by_its_return(
     improvement, anchors, tmp_path, monkeypatch
 ):

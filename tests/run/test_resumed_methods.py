@@ -27,7 +27,7 @@ PLASTIC = {
         pytest.param(
             *("csp", 5, "chunk", "task-001-step-0000020", {}), marks=pytest.mark.slow
         ),
-        ("ft1", 5, "chunk", "task-001", PLASTIC),
+        pytest.param(*("ft1", 5, "chunk", "task-001", PLASTIC), marks=pytest.mark.slow),
     ],
 )
 def test_what_a_method_needs_within_a_task_is_saved(
