@@ -66,7 +66,7 @@ class Alignment:
 
     observations: int = 17
     width: int = 128
-    updates: tuple[int, ...] = (100, 1_000, 5_000, 10_000, 20_000)
+    updates: tuple[int, ...] = (100, 1_000, 5_000, 10_000)
     rate: float = 1e-3
     beta: float = 100.0
     tau: float = 0.1
