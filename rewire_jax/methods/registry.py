@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import (
+    cka,
     clonex,
     csp_settings,
     finetune,
@@ -63,6 +64,7 @@ METHODS: dict[str, Entry] = {
         rewire_settings.preset,
         together=rewire_settings.together,
     ),
+    "cka": Entry(cka.cka, cka.CkaSettings, cka.preset),
     "clonex": Entry(
         clonex.clonex, clonex.ClonexSettings, clonex.preset, selection_episodes=1
     ),

@@ -30,7 +30,7 @@ SPEC = ScenarioSpec("probe/corners", "reach", CHANGES, 1, 6400)
 SCENARIO = make_scenario(SPEC)
 SEEDS = 3
 PULLED = ("ft_l2", "ewc")
-KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp")
+KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp", "cka")
 QUICK = ("ft1", "rewire")
 # Where the quick profile's values do not fit networks and budgets this small.
 OPTIONS: dict[str, dict] = {
