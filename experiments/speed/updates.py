@@ -14,7 +14,7 @@ from experiments.suite import Row, show
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.transition import Batch
 from rewire_jax.methods import find_method
-from rewire_jax.methods.base import Round
+from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.training import sac
 from rewire_jax.training.run_setup import prepare
@@ -50,8 +50,8 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
         kept = method.end_task(
             learner.params, learner.method_state, jnp.asarray(0), None
         )
-        params, method_state = method.start_task(member.keys, *kept, jnp.asarray(1))
-        learner = learner._replace(params=params, method_state=method_state)
+        began = method.start_task(member.keys, *kept, jnp.asarray(1))
+        learner = learner.with_learned(began)
         return member, sac.restart(learner, member.sac)
 
     def advance(state, batches, count):
@@ -73,12 +73,10 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
             made = jnp.minimum(drawn, count - first)
             numbers = draws, batch, first, made
             learner, metrics = sac.updates(learner, *numbers, method, member.sac)
-            params, method_state = method.after_round(
-                learner.params,
-                learner.method_state,
-                Round(first, first + drawn, metrics),
+            latest = Round(first, first + drawn, metrics)
+            return learner.with_learned(
+                method.after_round(learner.params, learner.method_state, latest)
             )
-            return learner._replace(params=params, method_state=method_state)
 
         return member, jax.lax.fori_loop(0, -(-count // drawn), several, learner)
 

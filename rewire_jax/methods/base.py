@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
+from rewire_jax.methods.round import Round
 
 Params = Any
 """Pytree that the policy's optimiser trains."""
@@ -22,20 +23,6 @@ Policy = Any
 CandidateScore = Literal["episode", "since_reset"]
 Purpose = Literal["act", "critic", "policy"]
 """The use of a context: an acting step, or an update of the critics or the policy."""
-
-
-class Round(NamedTuple):
-    """A round of updates that was made.
-
-    Attributes:
-      before: `[]` int, the task's updates before it; shared by all members.
-      after: `[]` int, the same with it.
-      metrics: `[]` each, metrics of its last update, "temperature" among them.
-    """
-
-    before: jax.Array
-    after: jax.Array
-    metrics: dict[str, jax.Array]
 
 
 class Tools(NamedTuple):

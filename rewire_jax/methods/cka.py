@@ -18,9 +18,6 @@ from rewire_jax.core.settings import require, settings
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
-from rewire_jax.nn.networks import Linear
-
-Layers = tuple[Linear, ...]
 
 
 @settings
@@ -50,11 +47,11 @@ class Params(NamedTuple):
     """What a task trains.
 
     Attributes:
-      vector: its own vector; in the first task the base itself.
+      vector: `[numbers]`, its own vector; in the first task the base itself.
       logits: `[pool]`, of the vectors in the pool.
     """
 
-    vector: Layers
+    vector: jax.Array
     logits: jax.Array
 
 
@@ -103,6 +100,7 @@ def cka(spec: Spec, options: CkaSettings) -> Method:
     size = options.pool
     shapes = jax.eval_shape(lambda: networks.init_mlp(jax.random.key(0), spec.sizes()))
     numbers = count(shapes)
+    _, layers = ravel_pytree(jax.tree.map(jnp.zeros_like, shapes))
 
     def known(state):
         return jnp.clip(state.learned - 1, 0, size)
@@ -114,17 +112,13 @@ def cka(spec: Spec, options: CkaSettings) -> Method:
         odds = jnp.where(valid, jnp.exp(shifted), 0.0)
         return odds / jnp.maximum(jnp.sum(odds), 1e-12)
 
-    def layers(flat):
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return ravel_pytree(zeros)[1](flat)
-
     def current(params, state):
-        shared = layers(state.base + mixture(params, state) @ state.pool)
-        return jax.tree.map(jnp.add, shared, params.vector)
+        mixed = mixture(params, state) @ state.pool
+        return layers(state.base + mixed + params.vector)
 
     def init(key):
-        params = Params(networks.init_mlp(key, spec.sizes()), jnp.zeros(size))
-        return params, State(
+        vector, _ = ravel_pytree(networks.init_mlp(key, spec.sizes()))
+        return Params(vector, jnp.zeros(size)), State(
             learned=jnp.zeros((), jnp.int32),
             base=jnp.zeros(numbers),
             pool=jnp.zeros((size, numbers)),
@@ -133,18 +127,17 @@ def cka(spec: Spec, options: CkaSettings) -> Method:
 
     def start_task(key, params, state, task):
         del key, task
-        first = state.learned == 0
-        vector = jax.tree.map(lambda x: jnp.where(first, x, 0.0), params.vector)
+        vector = jnp.where(state.learned == 0, params.vector, 0.0)
         return Params(vector, jnp.zeros(size)), state
 
     def end_task(params, state, task, selection):
         del selection
-        vector, _ = ravel_pytree(params.vector)
         place = known(state)
         pool = jnp.concatenate([state.pool, jnp.zeros((1, numbers))])
         weights = jnp.pad(state.weights, ((0, 0), (0, 1)))
         own = jnp.pad(mixture(params, state), (0, 1)).at[place].set(1.0)
-        pool, weights = pool.at[place].set(vector), weights.at[task].set(own)
+        pool = pool.at[place].set(params.vector)
+        weights = weights.at[task].set(own)
         merged = merge(pool, weights)
         full = place == size
         pool, weights = jax.tree.map(
@@ -153,17 +146,15 @@ def cka(spec: Spec, options: CkaSettings) -> Method:
         first = state.learned == 0
         return params, State(
             learned=state.learned + 1,
-            base=jnp.where(first, vector, state.base),
+            base=jnp.where(first, params.vector, state.base),
             pool=jnp.where(first, state.pool, pool),
             weights=jnp.where(first, state.weights, weights),
         )
 
     def policy(params, state, task):
         latest = jnp.minimum(task, jnp.maximum(state.learned - 1, 0))
-        kept = layers(state.base + state.weights[latest] @ state.pool)
-        return jax.tree.map(
-            lambda a, b: jnp.where(state.learned > 0, a, b), kept, params.vector
-        )
+        kept = state.base + state.weights[latest] @ state.pool
+        return layers(jnp.where(state.learned > 0, kept, params.vector))
 
     return Method(
         init=init,
@@ -171,8 +162,8 @@ def cka(spec: Spec, options: CkaSettings) -> Method:
         distribution=lambda params, state, context, observation: act(
             current(params, state), observation
         ),
-        hidden=lambda params, state, observation: networks.hidden_activations(
-            current(params, state), observation, networks.ACTIVATIONS[spec.network]
+        hidden=lambda params, state, observation: networks.hidden_of(spec.network)(
+            current(params, state), observation
         ),
         end_task=end_task,
         policy=policy,

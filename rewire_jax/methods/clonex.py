@@ -155,8 +155,7 @@ def clonex(spec: Spec, options: ClonexSettings) -> Method:
 
     def hidden(params, state, observation):
         policy = layers(params, state.learned % slots)
-        activation = networks.ACTIVATIONS[spec.network]
-        return networks.hidden_activations(policy, observation, activation)
+        return networks.hidden_of(spec.network)(policy, observation)
 
     def penalty(key, params, state, context, observation, gaussian):
         del context, observation, gaussian

@@ -182,8 +182,7 @@ def hidden(
     anchors = put(state.anchors, state.frozen, params)
     used = jnp.arange(design.spec.tasks) <= state.frozen
     mean = fold(anchors, used / (state.frozen + 1))
-    activation = networks.ACTIVATIONS[design.spec.network]
-    return networks.hidden_activations(mean, observation, activation)
+    return networks.hidden_of(design.spec.network)(mean, observation)
 
 
 def critic_input(context: jax.Array, observation: jax.Array) -> jax.Array:

@@ -51,8 +51,8 @@ def ft1(spec: Spec, options: FinetuneSettings) -> Method:
         policy=lambda params, state, task: params,
         act=act,
         size=lambda params, state: jnp.asarray(count(params)),
-        hidden=lambda params, state, observation: networks.hidden_activations(
-            params, observation, networks.ACTIVATIONS[spec.network]
+        hidden=lambda params, state, observation: networks.hidden_of(spec.network)(
+            params, observation
         ),
         redo_policy=True,
     )

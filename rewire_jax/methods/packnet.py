@@ -140,8 +140,8 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
         policy=policy,
         act=act,
         size=lambda params, state: jnp.asarray(count(params) + count(state.owners)),
-        hidden=lambda params, state, observation: networks.hidden_activations(
-            params, observation, networks.ACTIVATIONS[spec.network]
+        hidden=lambda params, state, observation: networks.hidden_of(spec.network)(
+            params, observation
         ),
         adjust_updates=adjust_updates,
         consolidate=consolidate,

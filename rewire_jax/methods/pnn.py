@@ -189,7 +189,7 @@ def play(
     column: Column,
     place: jax.Array,
     observation: jax.Array,
-    activation: networks.Activation | networks.Residual,
+    activation: networks.AnyActivation,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std of a column, each `[..., actions]`; see `run_columns`."""
     arguments = columns, column, place, observation, activation
@@ -201,7 +201,7 @@ def run_columns(
     column: Column,
     place: jax.Array,
     observation: jax.Array,
-    activation: networks.Activation | networks.Residual,
+    activation: networks.AnyActivation,
 ) -> tuple[list[jax.Array], jax.Array]:
     """`run_column`, and what comes before; gradients flow only into this column.
 
@@ -239,7 +239,7 @@ def run_column(
     place: jax.Array,
     earlier: list[jax.Array],
     observation: jax.Array,
-    activation: networks.Activation | networks.Residual,
+    activation: networks.AnyActivation,
 ) -> tuple[list[jax.Array], jax.Array]:
     """A column's hidden activations and output.
 

@@ -181,7 +181,7 @@ def _pulled(
 def fisher_diagonal(
     layers: tuple[Linear, ...],
     states: jax.Array,
-    activation: networks.Activation | networks.Residual = networks.activate,
+    activation: networks.AnyActivation = networks.activate,
 ) -> tuple[Linear, ...]:
     """Diagonal of the Fisher information of a policy's Gaussian, in closed form.
 

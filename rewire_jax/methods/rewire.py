@@ -13,18 +13,12 @@ from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import require
 from rewire_jax.methods import rewire_alignment as alignment
 from rewire_jax.methods import wiring
-from rewire_jax.methods.base import (
-    Candidates,
-    Method,
-    Policy,
-    Purpose,
-    Round,
-    Selection,
-)
+from rewire_jax.methods.base import Candidates, Method, Policy, Purpose, Selection
 from rewire_jax.methods.rewire_cloning import with_cloning
 from rewire_jax.methods.rewire_losses import Gaussian, distillation_loss, gaussian_kl
 from rewire_jax.methods.rewire_settings import DISTILLED_STATES, RewireSettings
 from rewire_jax.methods.rewire_state import Context, Design, Params, State
+from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.wired_layers import wired
@@ -266,8 +260,7 @@ def hidden(
 ) -> list[jax.Array]:
     """See `base.Hidden`; of the first mode, without noise and dropout."""
     first = jax.tree.map(lambda x: x[0], mode_policies(design, params, state))
-    activation = networks.ACTIVATIONS[design.spec.network]
-    return networks.hidden_activations(first, observation, activation)
+    return networks.hidden_of(design.spec.network)(first, observation)
 
 
 def select_order(

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.methods import matching, wiring
-from rewire_jax.methods.base import Round
 from rewire_jax.methods.rewire_losses import alignment_loss, weight_loss
 from rewire_jax.methods.rewire_state import Design, Params, State
+from rewire_jax.methods.round import Round
 
 
 def penalty(design: Design, params: Params, state: State) -> jax.Array:
@@ -34,10 +34,8 @@ def penalty(design: Design, params: Params, state: State) -> jax.Array:
 
 def match_in_time(design: Design, params: Params, state: State, made: Round) -> Params:
     """Solves for the adapters if `match_every` updates have passed."""
-    every = design.options.match_every
-    # All members share the condition, so vmap keeps the branch.
     adapters = jax.lax.cond(
-        made.before // every < made.after // every,
+        made.completes(design.options.match_every),
         lambda: matching.match(params.hidden, state.previous, params.adapters),
         lambda: params.adapters,
     )

@@ -65,8 +65,11 @@ class Residual:
     activation: Activation
 
 
+AnyActivation = Activation | Residual
+
+
 def between(
-    activation: Activation | Residual, x: jax.Array, below: jax.Array | None
+    activation: AnyActivation, x: jax.Array, below: jax.Array | None
 ) -> jax.Array:
     """A hidden layer's activations `[..., neurons]`.
 
@@ -96,7 +99,7 @@ def normalize_and_activate(x: jax.Array) -> jax.Array:
     return activate(jax.nn.standardize(x, variance=variance, epsilon=1e-6))
 
 
-ACTIVATIONS: Mapping[str, Activation | Residual] = {
+ACTIVATIONS: Mapping[str, AnyActivation] = {
     "mlp": activate,
     "layer_norm": normalize_and_activate,
     "residual": Residual(normalize_and_activate),
@@ -178,7 +181,7 @@ class MLP(nn.Module):
     """
 
     features: Sequence[int]
-    activation: Activation | Residual = activate
+    activation: AnyActivation = activate
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -224,7 +227,7 @@ def init_mlp(key: jax.Array, sizes: Sequence[int]) -> tuple[Linear, ...]:
 
 
 def mlp(
-    layers: Sequence[Linear], x: jax.Array, activation: Activation | Residual = activate
+    layers: Sequence[Linear], x: jax.Array, activation: AnyActivation = activate
 ) -> jax.Array:
     """Applies the `MLP` with these layers, `[..., inputs]` -> `[..., outputs]`."""
     network = MLP([layer.bias.shape[-1] for layer in layers], activation)
@@ -233,7 +236,7 @@ def mlp(
 
 
 def hidden_activations(
-    layers: Sequence[Linear], x: jax.Array, activation: Activation | Residual = activate
+    layers: Sequence[Linear], x: jax.Array, activation: AnyActivation = activate
 ) -> list[jax.Array]:
     """Activations `[..., neurons]` of each hidden layer of the `MLP`."""
     activations: list[jax.Array] = []
@@ -244,8 +247,14 @@ def hidden_activations(
     return activations
 
 
+@functools.cache
+def hidden_of(network: str) -> Callable[..., list[jax.Array]]:
+    """`hidden_activations` with a network's activation."""
+    return functools.partial(hidden_activations, activation=ACTIVATIONS[network])
+
+
 def sizes(layers: Sequence[Linear]) -> list[int]:
-    """Those with which `init_mlp` makes layers of the same shapes."""
+    """The sizes from which `init_mlp` makes layers of the same shapes."""
     return [layers[0].weight.shape[-1], *(layer.bias.shape[-1] for layer in layers)]
 
 
@@ -258,7 +267,7 @@ def gaussian(output: jax.Array) -> tuple[jax.Array, jax.Array]:
 def mlp_policy(
     layers: Sequence[Linear],
     observation: jax.Array,
-    activation: Activation | Residual = activate,
+    activation: AnyActivation = activate,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean and log-std, each `[..., actions]`, of a plain MLP policy."""
     return gaussian(mlp(layers, observation, activation))

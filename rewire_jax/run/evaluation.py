@@ -187,10 +187,8 @@ def _policies(folder: Path, stage: int, plan: Plan) -> tuple[Any, np.ndarray]:
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = learner.params, learner.method_state
     owner = run_state.identity(plan.settings, plan.members)
-    (params, method_state), active = run_state.read_policies(folder, stage, like, owner)
-    learner = plan.program.init(plan.stacked)._replace(
-        params=params, method_state=method_state
-    )
+    learned, active = run_state.read_policies(folder, stage, like, owner)
+    learner = plan.program.init(plan.stacked).with_learned(learned)
     return plan.program.policies(plan.stacked, learner), active
 
 

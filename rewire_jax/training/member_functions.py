@@ -88,7 +88,7 @@ class MemberFunctions:
         params, method_state = method.start_task(
             keys.method, learner.params, learner.method_state, index
         )
-        learner = learner._replace(params=params, method_state=method_state)
+        learner = learner.with_learned((params, method_state))
         if method.fresh_critic:
             critic = sac.init_critic(keys.critic, self.spec, method.critic_extra)
             learner = sac.start_critic(learner, critic, member.sac)
@@ -112,9 +112,8 @@ class MemberFunctions:
         method, learner = self.method(member), state.learner
         assert method.after_baseline is not None
         learned = method.after_baseline(learner.params, learner.method_state, before)
-        params, method_state = learned
         return state._replace(
-            learner=learner._replace(params=params, method_state=method_state),
+            learner=learner.with_learned(learned),
             acting=learned if self.shape.overlap else (),
         )
 
@@ -157,15 +156,14 @@ class MemberFunctions:
             inputs = method.critic_input(context, observation)
             return sac.q_values(learner.critic, inputs, action, member.sac.network)
 
-        params, method_state = method.consolidate(
+        learned = method.consolidate(
             self.keys(member, index).consolidate,
             learner.params,
             learner.method_state,
             index,
             Tools(sample, q),
         )
-        learner = learner._replace(params=params, method_state=method_state)
-        return sac.restart(learner, member.sac)
+        return sac.restart(learner.with_learned(learned), member.sac)
 
     def offline_update(
         self,
@@ -211,10 +209,10 @@ class MemberFunctions:
         selection: Selection | None,
     ) -> TrainState:
         """Ends a task, with the returns of the candidates."""
-        params, method_state = self.method(member).end_task(
+        learned = self.method(member).end_task(
             learner.params, learner.method_state, index, selection
         )
-        return learner._replace(params=params, method_state=method_state)
+        return learner.with_learned(learned)
 
     def policies(self, member: Members, learner: TrainState) -> Any:
         """Returns the policies of all tasks, `[tasks]` except `Shared` parts."""

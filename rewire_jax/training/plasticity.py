@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
-from rewire_jax.methods.base import Method, Round
+from rewire_jax.methods.base import Method
+from rewire_jax.methods.round import Round
 from rewire_jax.nn import dormancy, networks
 from rewire_jax.training import random_keys
 from rewire_jax.training.random_keys import RedoKeys
@@ -19,12 +20,10 @@ def critic_activations(
     learner: TrainState, batch: Batch, method: Method, sac: SacSettings
 ) -> list[jax.Array]:
     """Activations `[2, batch, hidden]` of each hidden layer of both critics."""
-    activation = networks.ACTIVATIONS[sac.network]
     inputs = method.critic_input(batch.extras, batch.observation)
     inputs = jnp.concatenate([inputs, batch.action], axis=-1)
-    return jax.vmap(lambda c: networks.hidden_activations(c, inputs, activation))(
-        learner.critic
-    )
+    hidden = networks.hidden_of(sac.network)
+    return jax.vmap(hidden, (0, None))(learner.critic, inputs)
 
 
 def metrics(
@@ -62,20 +61,17 @@ def redo_in_time(
       key: a random key.
       learner: the member's learner.
       sample: `key -> Batch`, draws a batch of the buffer.
-      made: the round that was just made. All members share its counts, so vmap keeps
-        the branch.
+      made: the round that was just made.
       method: the member's method.
       sac: SAC's settings.
     """
-    every = sac.redo_every
-    due = made.after // every > made.before // every
     policy_state, critic_state, temperature_state = learner.optimizers
     # Only what the branch changes goes through it: the rest would be copied.
     critic = learner.critic, critic_state
     policy = (learner.params, policy_state) if method.redo_policy else ()
 
     critic, policy = jax.lax.cond(
-        due,
+        made.completes(sac.redo_every),
         lambda _: _redo(random_keys.named(RedoKeys, key), learner, sample, method, sac),
         lambda parts: parts,
         (critic, policy),

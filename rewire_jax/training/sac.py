@@ -40,6 +40,11 @@ class TrainState(NamedTuple):
     optimizers: tuple[Any, Any, Any]
     critic_start: Any = ()
 
+    def with_learned(self, learned: tuple[Params, MethodState]) -> "TrainState":
+        """Returns it with the parameters and the state that a method returned."""
+        params, method_state = learned
+        return self._replace(params=params, method_state=method_state)
+
 
 def init(key: jax.Array, method: Method, spec: Spec, sac: SacSettings) -> TrainState:
     """Returns a learner before its first task."""

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.methods.base import Method, Round
+from rewire_jax.methods.base import Method
+from rewire_jax.methods.round import Round
 from rewire_jax.training import (
     exploration,
     plasticity,
@@ -192,10 +193,8 @@ def update_from_buffer(
             learner = plasticity.redo_in_time(
                 keys.redo, learner, fresh_batch, made, method, settings
             )
-        params, method_state = method.after_round(
-            learner.params, learner.method_state, made
-        )
-        return learner._replace(params=params, method_state=method_state), metrics
+        learned = method.after_round(learner.params, learner.method_state, made)
+        return learner.with_learned(learned), metrics
 
     # A loop with at most one iteration. All members share `due`, so vmap keeps it.
     learner, metrics = jax.lax.fori_loop(
@@ -311,7 +310,7 @@ def inspect(
     method: Method,
     settings: SacSettings,
 ) -> sac.Metrics:
-    """Returns metrics of the state; `length` is the episode length."""
+    """Returns metrics of the learner on a batch; `length` is the episode length."""
     batch_key = random_keys.of_step(key, time).inspect
     buffer, learner = state.collection.buffer, state.learner
     batch = replay_buffer.sample(buffer, batch_key, time, settings.batch_size, length)

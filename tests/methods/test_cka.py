@@ -89,7 +89,7 @@ def test_a_policy_is_base_and_softmax_of_the_pool_and_its_own_vector():
     odds = np.exp(logits) / np.exp(logits).sum()
     pool = np.asarray(state.pool, np.float64)[:2]
     expected = state.base + odds @ pool + flat(params.vector)
-    _, unravel = ravel_pytree(params.vector)
+    _, unravel = ravel_pytree(method.policy(params, state, 0))
     wanted = networks.mlp_policy(
         unravel(jnp.asarray(expected, jnp.float32)), OBSERVATION
     )

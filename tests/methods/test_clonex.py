@@ -9,8 +9,9 @@ import pytest
 import rewire_jax
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.transition import Batch
-from rewire_jax.methods.base import Round, Tools
+from rewire_jax.methods.base import Tools
 from rewire_jax.methods.clonex import ClonexSettings, clonex
+from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.storage.run_results import read_run
 from tests.tiny import tiny

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rewire_jax import make_train
-from rewire_jax.methods.base import Round
 from rewire_jax.methods.rewire_state import Context
+from rewire_jax.methods.round import Round
 from rewire_jax.nn.networks import Linear
 from tests.rewired import (
     DEPTH,

@@ -11,7 +11,7 @@ from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import METHODS, find_method
-from rewire_jax.methods.base import Round
+from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training import plasticity, random_keys, sac
