@@ -22,6 +22,7 @@ import optax
 from experiments import suite
 from rewire_jax.methods import matching, rewire_losses, wiring
 from rewire_jax.nn import networks
+from rewire_jax.reports import plots
 
 # Form of the loss, factor on the adapters' learning rate.
 VARIANTS = (
@@ -66,7 +67,7 @@ class Alignment:
 
     observations: int = 17
     width: int = 128
-    updates: tuple[int, ...] = (100, 1_000, 5_000, 10_000)
+    updates: tuple[int, ...] = (100, 300, 1_000, 3_000, 10_000)
     rate: float = 1e-3
     beta: float = 100.0
     tau: float = 0.1
@@ -184,6 +185,32 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     return lines
 
 
+def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """Writes the picture: each measure against updates."""
+    figure, panels = plots.empty((11.0, 3.8), 1, len(MEASURES))
+    looks = sorted({row["updates"] for row in rows})
+    for axes, (measure, (name, _)) in zip(panels, MEASURES.items(), strict=True):
+        for i, (form, rate) in enumerate(VARIANTS):
+            means = [
+                statistics.mean(
+                    row[measure]
+                    for row in rows
+                    if (row["form"], row["rate"], row["updates"]) == (form, rate, look)
+                )
+                for look in looks
+            ]
+            label = f"{form}, adapter rate {rate}" if rate else form
+            axes.plot(looks, means, marker=".", **plots.look(i), label=label)
+        axes.set_xscale("log")
+        axes.set_xlabel("updates")
+        axes.set_title(name, fontsize=11)
+        axes.grid(axis="y", color="0.9")
+    lines, labels = panels[0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="outside right center", frameon=False)
+    plots.entitle(figure, title, "0: the old policies are as before")
+    figure.savefig(path)
+
+
 def run(job: Alignment) -> None:
     """Computes all variants and writes the result."""
     rows = []
@@ -196,7 +223,9 @@ def run(job: Alignment) -> None:
             rows.append(row | dict(zip(MEASURES, found[:, seed, look], strict=True)))
     title = f"Alignment alone, width {job.width}, beta {job.beta:g}"
     title += f", mean of {job.seeds} seeds"
-    suite.write(job.out, title, table(rows), NOTES, rows)
+    picture = f"![Alignment alone]({job.out.name}.png)"
+    suite.write(job.out, title, table(rows), [*NOTES, "", picture], rows)
+    draw(rows, title, job.out.with_suffix(".png"))
 
 
 if __name__ == "__main__":

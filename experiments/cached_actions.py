@@ -1,0 +1,172 @@
+"""Do later tasks change old policies? Compares their actions after each later task.
+
+For each task of a campaign's runs: the policy plays one episode of the task right after
+its own training, and the visited states are kept. In these states, the policy of the
+task after each later task acts again.
+"""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import rewire_jax
+from experiments import suite
+from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import require
+from rewire_jax.envs.base import Environment, HostEnvironment
+from rewire_jax.reports import plots
+from rewire_jax.reports.campaign_data import read_campaign_data
+from rewire_jax.training.acting import Act
+
+NOTES = (
+    "Squared change of a policy's actions in the states that it visits in its own task "
+    "right after its training, relative to their variance. 0: it acts as before. 2: as "
+    "another policy with actions of the same mean and variance. Mean, and lowest to "
+    "highest, over tasks and seeds.",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kept:
+    """What to compare.
+
+    Attributes:
+      file: TOML file of a campaign on compiled environments.
+      runs: folder of the campaign; by default runs/ and the name of the file.
+      out: the result files, without a suffix; by default in experiments/results.
+    """
+
+    file: Path
+    runs: Path | None = None
+    out: Path | None = None
+
+
+def visited(
+    environment: Environment, act: Act, learned: Any, task: jax.Array, data: Any
+) -> jax.Array:
+    """Observations `[steps, observations]` of one episode, up to its end."""
+
+    def step(state, _):
+        after = environment.step(data, state, act(learned, task, state.observation))
+        # After its end an episode stays where it ended.
+        after = jax.tree.map(
+            lambda old, new: jnp.where(state.terminal, old, new), state, after
+        )
+        return after, state.observation
+
+    start = environment.reset(data, jax.random.key(0))
+    return jax.lax.scan(step, start, length=environment.episode_length)[1]
+
+
+def change(before: jax.Array, after: jax.Array) -> jax.Array:
+    """`[]`, of actions `[steps, actions]`, see `NOTES`."""
+    return jnp.mean((after - before) ** 2) / jnp.mean(jnp.var(before, axis=0))
+
+
+def measure(folder: Path, scenario: rewire_jax.Scenario) -> list[dict[str, Any]]:
+    """A row for each task, each later task and each seed of a finished run.
+
+    Raises:
+      UserError: the host steps the environment.
+    """
+    environment = scenario.environment
+    if isinstance(environment, HostEnvironment):
+        raise UserError(f"{folder}: use runs on compiled environments")
+    first = rewire_jax.load_policies(folder)
+    act = jax.jit(first.act)
+    play = jax.jit(partial(visited, environment, first.act))
+    stages = [
+        rewire_jax.load_policies(folder, stage=stage)
+        for stage in range(len(first.tasks))
+    ]
+    rows = []
+    for seed in first.seeds:
+        learned = [policies.member(seed) for policies in stages]
+        for task in range(len(stages) - 1):
+            states = play(learned[task], task, scenario.tasks[task].data)
+            before, *later = (act(member, task, states) for member in learned[task:])
+            rows += [
+                {
+                    "seed": seed,
+                    "task": first.tasks[task],
+                    "later": number,
+                    "change": float(change(before, actions)),
+                }
+                for number, actions in enumerate(later, 1)
+            ]
+    return rows
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """For people: a line for each configuration."""
+    numbers = sorted({row["later"] for row in rows})
+    lines = [["method", *(f"{n} later" for n in numbers), "seeds"]]
+    for label, own in _by_label(rows).items():
+        cells = [[row["change"] for row in own if row["later"] == n] for n in numbers]
+        seeds = len({row["seed"] for row in own})
+        lines.append([label, *map(_text, cells), str(seeds)])
+    return lines
+
+
+def _text(values: Sequence[float]) -> str:
+    """Mean and lowest to highest; the values may lie decades apart."""
+    low, high = min(values), max(values)
+    return f"{statistics.mean(values):.2g} ({low:.2g} to {high:.2g})"
+
+
+def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """Writes the picture: change against the number of later tasks."""
+    figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
+    for i, (label, own) in enumerate(_by_label(rows).items()):
+        later = sorted({row["later"] for row in own})
+        values = [[row["change"] for row in own if row["later"] == n] for n in later]
+        style = plots.look(i)
+        axes.plot(later, [statistics.mean(v) for v in values], **style, label=label)
+        for n, each in zip(later, values, strict=True):
+            axes.scatter([n] * len(each), each, color=style["color"], s=12)
+    axes.set_xticks(sorted({row["later"] for row in rows}))
+    axes.set_xlabel("later tasks")
+    axes.set_ylabel("change of actions")
+    axes.set_ylim(0, None)
+    axes.grid(axis="y", color="0.9")
+    figure.legend(loc="outside right center", frameon=False)
+    plots.entitle(figure, title, "lines: mean; points: a task of a seed")
+    figure.savefig(path)
+
+
+def _by_label(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    labels = dict.fromkeys(row["method"] for row in rows)
+    return {name: [row for row in rows if row["method"] == name] for name in labels}
+
+
+def run(job: Kept) -> None:
+    """Measures all finished runs and writes the result.
+
+    Raises:
+      UserError: the campaign cannot be read, or no run with several tasks is finished.
+    """
+    data = read_campaign_data(job.file, job.runs)
+    rows = []
+    for one in data.jobs:
+        settings = one.run.settings
+        if not one.done or settings.tasks < 2:
+            continue
+        scenario = rewire_jax.make_scenario(settings.scenario, settings.backend)
+        label = one.run.configuration
+        rows += [{"method": label} | row for row in measure(one.folder, scenario)]
+    require(bool(rows), f"no run of {job.file} with several tasks is finished")
+    title = f"Change of old policies' actions. {data.campaign.title}"
+    out = job.out or suite.RESULTS / f"cached-actions-{job.file.stem}"
+    picture = f"![Change of actions]({out.name}.png)"
+    suite.write(out, title, table(rows), [*NOTES, "", picture], rows)
+    draw(rows, title, out.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    suite.command(Kept, run, "cached_actions")
