@@ -171,10 +171,7 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     q = q_values(critic, inputs, batch.action, sac.network)
     error = q - jax.lax.stop_gradient(target)
     loss = jnp.sum(jnp.mean(error**2, axis=-1))
-    if sac.l2_init:
-        loss += sac.l2_init * critic_penalties.l2_init(critic, learner.critic_start)
-    if sac.parseval:
-        loss += sac.parseval * critic_penalties.parseval(critic)
+    loss = critic_penalties.add(loss, critic, learner.critic_start, sac)
     return loss, jnp.mean(q)
 
 
