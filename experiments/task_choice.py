@@ -1,6 +1,7 @@
 """Are tasks recognised by their returns? Evaluates runs with task labels and without.
 
-Runs on the probe are trained first, unless they are finished. `--runs` adds others.
+Runs on the probe are trained first, unless they are finished. `--runs` adds others;
+`--methods` without a value leaves out the probe.
 """
 
 import itertools
@@ -16,9 +17,13 @@ from rewire_jax.core.formatting import number
 from rewire_jax.reports.provenance import origin
 from rewire_jax.storage.run_results import RunData, read_run
 
-PROBE, METHODS = "probe/reach", ("rewire", "sac_n")
+PROBE = "probe/reach"
 CHOSEN = ("recognised", "return", "interactions")
-SMALL = {"hidden": 32, "depth": 2}
+# Of SAC on the probe: small networks that learn it in seconds.
+SMALL = {"hidden": 32, "depth": 2, "batch_size": 64, "time_limit": "bootstrap"}
+SMALL |= {"lr_policy": 1e-3, "lr_critic": 3e-3, "lr_temperature": 1e-3}
+SMALL |= {"discount": 0.9, "reward_scale": 1.0, "noise_color": 0.0}
+SMALL |= {"critic_entropy": "sample", "policy_states": "current"}
 COLUMNS: suite.Columns = {
     "scenario": suite.show("scenario"),
     "run": suite.show("run"),
@@ -43,6 +48,7 @@ class TaskChoice(suite.Job):
     """What to evaluate.
 
     Attributes:
+      methods: names of the methods to train on the probe.
       runs: folders of other runs, with finished tasks.
       trials: numbers of trials to compare.
       shares: lengths of a trial to compare, each as a share of an episode.
@@ -52,18 +58,20 @@ class TaskChoice(suite.Job):
     """
 
     seeds: int = 3
+    methods: tuple[str, ...] = ("rewire", "sac_n")
     runs: tuple[Path, ...] = ()
     trials: tuple[int, ...] = (1, 4)
     shares: tuple[float, ...] = (0.05, 0.25, 1.0)
     episodes: int = 16
     out: Path = Path("runs/task-choice")
-    result: Path = suite.RESULTS / "task-choice" / "table"
+    result: Path = suite.RESULTS / "task-choice" / "probe"
 
     def probes(self) -> list[suite.Run]:
-        """Runs on the probe, with networks so small that they take seconds."""
+        """Runs on the probe."""
         scenario = self.scenario_of(PROBE)
         return [
-            self.run(scenario, method, self.out / method, SMALL) for method in METHODS
+            self.run(scenario, method, self.out / method, SMALL)
+            for method in self.methods
         ]
 
 
@@ -118,7 +126,7 @@ def run(job: TaskChoice) -> None:
     Raises:
       UserError: a folder holds no run with a finished task, or as `suite.train`.
     """
-    trained = suite.train(job.probes(), job)
+    trained = suite.train(job.probes(), job) if job.methods else []
     runs = [read_run(path) for path in (*(each.folder for each in trained), *job.runs)]
     rows = [row for each in runs for row in evaluated(job, each)]
     kinds: dict[str, list[RunData]] = {}

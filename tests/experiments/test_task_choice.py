@@ -71,7 +71,7 @@ def test_the_table_has_means_over_tasks_and_seeds(tmp_path, monkeypatch):
         assert row["return"] == 5 - (not right)
         assert row["labelled"] == 5
         assert row["interactions"] == 3 * trials * steps
-        assert row["seeds"] == (3 if name in task_choice.METHODS else 2)
+        assert row["seeds"] == (3 if name in job.methods else 2)
     page = job.result.with_suffix(".md").read_text()
     assert page.count("| rewire |") == 4
     assert str(tmp_path / "other") in page
@@ -89,7 +89,7 @@ def test_tasks_of_the_probe_are_recognised_in_long_trials(tmp_path, monkeypatch)
     )
     task_choice.run(job)
     rows = json.loads(job.result.with_suffix(".json").read_text())["rows"]
-    assert {row["run"] for row in rows} == set(task_choice.METHODS)
+    assert {row["run"] for row in rows} == set(job.methods)
     for row in task_choice.means(rows):
         assert row["recognised"] > 0.5
         assert row["interactions"] > 0
