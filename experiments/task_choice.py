@@ -20,7 +20,12 @@ from rewire_jax.storage.run_results import RunData, read_run
 PROBE = "probe/reach"
 CHOSEN = ("recognised", "return", "interactions")
 # Of SAC on the probe: small networks that learn it in seconds.
-SMALL = {"hidden": 32, "depth": 2, "batch_size": 64, "time_limit": "bootstrap"}
+SMALL: dict[str, Any] = {
+    "hidden": 32,
+    "depth": 2,
+    "batch_size": 64,
+    "time_limit": "bootstrap",
+}
 SMALL |= {"lr_policy": 1e-3, "lr_critic": 3e-3, "lr_temperature": 1e-3}
 SMALL |= {"discount": 0.9, "reward_scale": 1.0, "noise_color": 0.0}
 SMALL |= {"critic_entropy": "sample", "policy_states": "current"}
