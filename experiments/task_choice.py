@@ -24,11 +24,16 @@ SMALL: dict[str, Any] = {
     "hidden": 32,
     "depth": 2,
     "batch_size": 64,
+    "lr_policy": 1e-3,
+    "lr_critic": 3e-3,
+    "lr_temperature": 1e-3,
+    "discount": 0.9,
+    "reward_scale": 1.0,
+    "noise_color": 0.0,
     "time_limit": "bootstrap",
+    "critic_entropy": "sample",
+    "policy_states": "current",
 }
-SMALL |= {"lr_policy": 1e-3, "lr_critic": 3e-3, "lr_temperature": 1e-3}
-SMALL |= {"discount": 0.9, "reward_scale": 1.0, "noise_color": 0.0}
-SMALL |= {"critic_entropy": "sample", "policy_states": "current"}
 COLUMNS: suite.Columns = {
     "scenario": suite.show("scenario"),
     "run": suite.show("run"),

@@ -296,8 +296,8 @@ def test_a_member_is_the_same_alone(method: str) -> None:
     for whole, one in zip(
         jax.tree.leaves(together), jax.tree.leaves(alone), strict=True
     ):
-        # Where ClonEx's loss is 0 but for rounding, Adam still takes steps.
-        near = 1e-2 if method == "clonex" else 1e-4
+        # Where cloning's loss is 0 but for rounding, Adam still takes steps.
+        near = 1e-2 if method in ("clonex", "reset_distill") else 1e-4
         np.testing.assert_allclose(whole[1], one[0], rtol=1e-3, atol=near)
     others = [np.asarray(leaf) for leaf in jax.tree.leaves(together[0].params)]
     assert any(not np.allclose(leaf[0], leaf[1], atol=1e-3) for leaf in others)
