@@ -100,12 +100,16 @@ class SacSettings:
       noise_color: color of the exploration noise: 0 is white, 1 pink, 2 red
         (Eberhard et al., ICLR 2023). Updates always draw white noise.
       redo_every: critic updates between two resets of dormant neurons (ReDo, Sokar et
-        al., ICML 2023), 0 for none. It resets the critics and, in `ft1`, `ft_n` and
-        `sac_n`, the policy; other methods need the policy's neurons for earlier tasks.
+        al., ICML 2023), 0 for none. It resets the critics and, in `ft1`, `ft_n`,
+        `sac_n` and `reset_distill`, the policy in training; other methods need its
+        neurons for earlier tasks.
       dormant_threshold: a neuron is dormant if its mean absolute activation is at most
         this number times the mean of its layer.
       l2_init: coefficient of the squared distance of the critics' weights and biases
         to their first values, in the critics' loss (Kumar et al., 2023).
+      parseval: coefficient of the squared distance of W Wᵀ to 2 I, for the weights W of
+        the critics' hidden layers, in the critics' loss (Parseval regularization, Chung
+        et al., 2024, with 0.001 on Meta-World).
       plasticity_metrics: report the share of dormant neurons and the effective rank of
         the last hidden layer, of critics and policy.
     """
@@ -131,6 +135,7 @@ class SacSettings:
     redo_every: int = 0
     dormant_threshold: float = 0.025
     l2_init: float = static(0.0)
+    parseval: float = static(0.0)
     plasticity_metrics: bool = False
 
 
@@ -218,6 +223,7 @@ _AT_LEAST: dict[str, float] = {
     "redo_every": 0,
     "dormant_threshold": 0,
     "l2_init": 0,
+    "parseval": 0,
 }
 # Counters and floats have 32 bits. The other limits only prevent endless loops.
 _LARGEST = 2**31

@@ -73,8 +73,9 @@ def loss(
     earlier: jax.Array,
     batch: int,
     policy: Callable[[jax.Array, jax.Array], Gaussian],
+    divergence: Callable[[Gaussian, Gaussian], jax.Array] = gaussian_kl,
 ) -> jax.Array:
-    """KL(stored || current), the mean over randomly drawn states.
+    """The divergence of the current policy from the stored one in random states.
 
     Args:
       key: a random key.
@@ -83,9 +84,10 @@ def loss(
       batch: number of states, drawn with replacement.
       policy: `(slot, observation) -> mean, log-std`, of a `[]` int and
         `[observations]`: the policy of the slot's task, as it is now.
+      divergence: of stored and current Gaussians; by default KL(stored || current).
 
     Returns:
-      `[]`, 0 if there is no slot to draw from.
+      `[]`, the mean over states, 0 if there is no slot to draw from.
     """
     slot_key, state_key = jax.random.split(key)
     odds = jnp.where(earlier, 0.0, -jnp.inf)
@@ -93,8 +95,8 @@ def loss(
     state = jax.random.randint(state_key, (batch,), 0, memory.mean.shape[1])
     drawn = jax.tree.map(lambda x: x[slot, state], memory)
     now = jax.vmap(policy)(slot, drawn.observation)
-    divergence = jnp.mean(gaussian_kl((drawn.mean, drawn.log_std), now))
-    return jnp.where(jnp.any(earlier), divergence, 0.0)
+    lost = jnp.mean(divergence((drawn.mean, drawn.log_std), now))
+    return jnp.where(jnp.any(earlier), lost, 0.0)
 
 
 def stored(memory: Memory, learned: jax.Array) -> jax.Array:

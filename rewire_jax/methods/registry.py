@@ -12,6 +12,7 @@ from rewire_jax.methods import (
     packnet,
     pnn,
     regularization,
+    reset_distill,
     rewire_settings,
 )
 from rewire_jax.methods.base import Method
@@ -67,6 +68,11 @@ METHODS: dict[str, Entry] = {
     "cka": Entry(cka.cka, cka.CkaSettings, cka.preset),
     "clonex": Entry(
         clonex.clonex, clonex.ClonexSettings, clonex.preset, selection_episodes=1
+    ),
+    "reset_distill": Entry(
+        reset_distill.reset_distill,
+        reset_distill.ResetDistillSettings,
+        reset_distill.preset,
     ),
 }
 

@@ -13,6 +13,7 @@ from rewire_jax.core.transition import Batch
 from rewire_jax.methods.base import Method, MethodState, Params
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
+from rewire_jax.training import critic_penalties
 
 Metrics = dict[str, jax.Array]
 _ADAM = optax.scale_by_adam()
@@ -170,9 +171,7 @@ def _critic_loss(critic, learner, batch, draw, method, sac):
     q = q_values(critic, inputs, batch.action, sac.network)
     error = q - jax.lax.stop_gradient(target)
     loss = jnp.sum(jnp.mean(error**2, axis=-1))
-    if sac.l2_init:
-        away = jax.tree.map(lambda w, first: w - first, critic, learner.critic_start)
-        loss += sac.l2_init * sum(jnp.sum(w**2) for w in jax.tree.leaves(away))
+    loss = critic_penalties.add(loss, critic, learner.critic_start, sac)
     return loss, jnp.mean(q)
 
 

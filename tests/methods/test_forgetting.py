@@ -16,6 +16,7 @@ from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import TaskChange
 from rewire_jax.envs.scenarios import SCENARIOS, ScenarioSpec, make_scenario
 from rewire_jax.methods import METHODS
+from rewire_jax.nn import networks
 from rewire_jax.reports import metrics
 from rewire_jax.run import run_state
 from rewire_jax.storage import checkpoint
@@ -29,6 +30,7 @@ CHANGES = tuple(TaskChange(name, extra={"goal": goal}) for name, goal in GOALS.i
 SPEC = ScenarioSpec("probe/corners", "reach", CHANGES, 1, 6400)
 SCENARIO = make_scenario(SPEC)
 SEEDS = 3
+STATES = np.random.default_rng(0).uniform(-1, 1, (64, 2)).astype(np.float32)
 PULLED = ("ft_l2", "ewc")
 KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp", "cka")
 QUICK = ("ft1", "rewire")
@@ -41,6 +43,7 @@ OPTIONS: dict[str, dict] = {
     "pnn": {"width": 16},
     "csp": {"samples": 64, "estimations": 8},
     "clonex": {"states": 500},
+    "reset_distill": {"states": 500, "distill_updates": 2_000, "distill_rate": 1e-3},
 }
 
 
@@ -182,7 +185,7 @@ def test_what_is_kept_stays_bit_for_bit(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
     folder = trained(method).folder
-    observations = jax.random.uniform(jax.random.key(0), (64, 2), minval=-1.0)
+    observations = STATES
     for seed in range(SEEDS):
         load = functools.partial(rewire_jax.load_policy, folder, seed=seed)
         *now, latest = [load(task=t)(observations) for t in range(len(GOALS))]
@@ -198,7 +201,9 @@ def test_one_trace_for_all_tasks(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
     counts = trained(method).compiled
-    more = ["consolidate"] * (method in ("ewc", "packnet", "csp", "clonex"))
+    more = ["consolidate"] * (
+        method in ("ewc", "packnet", "csp", "clonex", "reset_distill")
+    )
     more += ["candidates"] * (method in ("rewire", "csp", "clonex"))
     more += ["after_baseline"] * (method == "clonex")
     # Only PackNet updates after its interactions.
@@ -239,6 +244,29 @@ def test_csp_plays_what_its_search_found(trained: Callable[[str], Trained]) -> N
         assert (best[-1] == proposals).all(axis=1).any()
 
 
+@pytest.mark.slow
+def test_what_was_learned_online_is_distilled(
+    trained: Callable[[str], Trained],
+) -> None:
+    prepared = run_setup.prepare(settings("reset_distill"), SCENARIO)
+    folder, observations = trained("reset_distill").folder, STATES
+    learner = jax.eval_shape(prepared.program.init, prepared.stacked)
+    like = {"policy": (learner.params, learner.method_state)}
+    online = []
+    for stage in range(len(GOALS)):
+        path = run_state.kept(folder, stage)
+        params, _ = checkpoint.load(path, like)[0]["policy"]
+        for seed in range(SEEDS):
+            first = jax.tree.map(lambda x, seed=seed: np.asarray(x)[seed], params)
+            expert = np.tanh(networks.mlp_policy(first, observations)[0])
+            load = functools.partial(rewire_jax.load_policy, folder, seed=seed)
+            own = load(task=stage, stage=stage)(observations)
+            assert np.abs(own - expert).mean() < 0.15
+            online.append(expert)
+    # Which says something, as policies of other tasks are far from it.
+    assert np.abs(online[0] - online[-SEEDS]).mean() > 0.5
+
+
 def short(method: str, seed: int, seeds: int):
     """A few updates in each of two tasks; learner, metrics and policies."""
     prepared = run_setup.prepare(
@@ -268,8 +296,8 @@ def test_a_member_is_the_same_alone(method: str) -> None:
     for whole, one in zip(
         jax.tree.leaves(together), jax.tree.leaves(alone), strict=True
     ):
-        # Where ClonEx's loss is 0 but for rounding, Adam still takes steps.
-        near = 1e-2 if method == "clonex" else 1e-4
+        # Where cloning's loss is 0 but for rounding, Adam still takes steps.
+        near = 1e-2 if method in ("clonex", "reset_distill") else 1e-4
         np.testing.assert_allclose(whole[1], one[0], rtol=1e-3, atol=near)
     others = [np.asarray(leaf) for leaf in jax.tree.leaves(together[0].params)]
     assert any(not np.allclose(leaf[0], leaf[1], atol=1e-3) for leaf in others)

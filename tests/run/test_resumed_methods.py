@@ -14,6 +14,7 @@ PLASTIC = {
     "redo_every": 10,
     "dormant_threshold": 0.5,
     "l2_init": 0.01,
+    "parseval": 0.001,
     "plasticity_metrics": True,
 }
 

@@ -14,7 +14,7 @@ from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
-from rewire_jax.training import plasticity, random_keys, sac
+from rewire_jax.training import critic_penalties, plasticity, random_keys, sac
 
 SPEC = Spec(observations=3, actions=2, hidden=6, depth=2, tasks=3)
 SETTINGS = SacSettings(
@@ -256,32 +256,67 @@ def test_dead_neurons_are_counted():
     assert found["dormant_policy"] == pytest.approx(2 / (2 * 6))
 
 
-def test_l2_init_pulls_critics_to_their_first_weights():
-    """Adam's first moments hold a tenth of the first gradient."""
+def critic_gradient(critic=None, **penalty):
+    """Of the critics' loss: Adam's first moments hold a tenth of the first gradient."""
+    settings = dataclasses.replace(SETTINGS, **penalty)
     method = make("ft1")
     batch = batch_for(method, ())
-    gradients = []
-    for coefficient in (0.0, 0.5):
-        settings = dataclasses.replace(SETTINGS, l2_init=coefficient)
-        learner = jax.jit(lambda key, s=settings: sac.init(key, method, SPEC, s))(KEY)
-        assert (learner.critic_start == ()) == (coefficient == 0)
-        first = learner.critic
-        moved = jax.tree.map(
-            lambda x: x + np.sin(np.arange(x.size)).reshape(x.shape), first
-        )
-        learner = learner._replace(critic=moved)
-        draw = sac.sample_noise(KEY, (), (), batch.action.shape, method, settings)
-        metrics = sac.first_metrics(learner, batch, draw, method, settings)
-        updated = jax.jit(sac.update, static_argnums=(5,))
-        after, _ = updated(learner, metrics, batch, draw, 0, method, settings)
-        if coefficient:
-            equal(after.critic_start, first)
-        gradients.append(jax.tree.map(lambda m: 10 * m, after.optimizers[1].mu))
+    learner = jax.jit(lambda key: sac.init(key, method, SPEC, settings))(KEY)
+    first = learner.critic
+    learner = learner._replace(critic=critic or first)
+    draw = sac.sample_noise(KEY, (), (), batch.action.shape, method, settings)
+    metrics = sac.first_metrics(learner, batch, draw, method, settings)
+    updated = jax.jit(sac.update, static_argnums=(5,))
+    after, _ = updated(learner, metrics, batch, draw, 0, method, settings)
+    equal(after.critic_start, learner.critic_start)
+    return first, jax.tree.map(lambda m: 10 * m, after.optimizers[1].mu), after
+
+
+def moved_critic(first):
+    return jax.tree.map(lambda x: x + np.sin(np.arange(x.size)).reshape(x.shape), first)
+
+
+def test_l2_init_pulls_critics_to_their_first_weights():
+    first, _, after = critic_gradient()
+    assert after.critic_start == ()
+    moved = moved_critic(first)
+    _, without, _ = critic_gradient(moved)
+    _, pulled, after = critic_gradient(moved, l2_init=0.5)
+    equal(after.critic_start, first)
     jax.tree.map(
         lambda without, pulled, w, start: np.testing.assert_allclose(
             pulled - without, 2 * 0.5 * (w - start), rtol=1e-3, atol=1e-3
         ),
-        *gradients,
-        moved,
-        first,
+        *(without, pulled, moved, first),
+    )
+
+
+def test_parseval_pulls_hidden_layers_to_orthogonal_ones():
+    first, *_ = critic_gradient()
+    moved = moved_critic(first)
+    _, without, _ = critic_gradient(moved)
+    _, pulled, _ = critic_gradient(moved, parseval=1e-3)
+    added = jax.tree.map(lambda a, b: np.asarray(a - b), pulled, without)
+    for layer, change in zip(moved[:-1], added[:-1], strict=True):
+        np.testing.assert_allclose(change.bias, 0, atol=1e-4)
+        for weight, got in zip(np.asarray(layer.weight), change.weight, strict=True):
+            n = len(weight)
+            away = weight @ weight.T - 2 * np.eye(n)
+            expected = 1e-3 * (64 / n) ** 2 * 4 * away @ weight
+            assert np.abs(expected).max() > 0.1
+            np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-3)
+    for leaf in added[-1]:
+        np.testing.assert_allclose(leaf, 0, atol=1e-4)
+
+
+def test_parseval_of_orthogonal_layers_is_zero():
+    rows, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(6, 6)))
+    layer = networks.Linear(jnp.asarray(2**0.5 * rows)[None], jnp.ones((1, 6)))
+    out = networks.Linear(jnp.ones((1, 1, 6)), jnp.ones((1, 1)))
+    assert critic_penalties.parseval((layer, out)) < 1e-8
+    twice = layer._replace(weight=2 * layer.weight)
+    # W Wᵀ is 8 I there.
+    expected = (64 / 6) ** 2 * 6 * 6**2
+    np.testing.assert_allclose(
+        critic_penalties.parseval((twice, out)), expected, rtol=1e-4
     )
