@@ -52,7 +52,6 @@ TESTS = {
     "training-i-z": "training/test_[i-z]*.py",
     "run": "run/test_*.py",
 }
-WIDTHS = (256, 1024)
 MEMBERS = (1, 2, 8, 32, 128)
 BACKENDS = ("v1", "positional", "spring", "mjx")
 ENVIRONMENTS = (128, 1024, 8192)
@@ -65,8 +64,7 @@ class Accelerator:
 
     Attributes:
       only: steps to make, in this order; all if none is named.
-      limit: time after which no step runs, for example 9m. A step that would take
-        longer than what is left is not begun.
+      limit: time to stop after, for example 9m. A step that needs more is not begun.
       list: print the steps, about how long each takes, and which are finished.
       tiny: a dry run of minutes, also on a CPU: sizes are tiny.
       out: folder of the results; by default `runs/accelerator`, or
@@ -108,9 +106,8 @@ class Accelerator:
         if self.error(step).exists():
             return "failed"
         path = self.folder / f"{step}.json"
-        if not path.exists():
-            return ""
-        return "finished" if json.loads(path.read_text())["finished"] else "begun"
+        result = json.loads(path.read_text()) if path.exists() else {}
+        return {None: "", False: "begun", True: "finished"}[result.get("finished")]
 
     def error(self, step: str) -> Path:
         """The file that a failed step leaves."""
@@ -133,7 +130,7 @@ def tests(pattern: str, job: Accelerator) -> dict[str, Any]:
     """Runs tests; the rows are those that did not pass."""
     pattern = "nn/test_dormancy.py" if job.tiny else pattern
     files = sorted(map(str, Path("tests").glob(pattern)))
-    # Several processes share the device. Tests compare with sums in full precision.
+    # Processes share the device. Tests compare with sums in full precision.
     shared = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     shared |= {"JAX_DEFAULT_MATMUL_PRECISION": "float32"}
     workers = min(4, (os.cpu_count() or 1) // 2)
@@ -172,18 +169,16 @@ def update_rates(policy: str, width: int, job: Accelerator) -> dict[str, Any]:
 
 def environment_rates(backend: str, job: Accelerator) -> dict[str, Any]:
     """Environment steps a second, with random actions."""
-    effort = job.effort
-    scenario = rewire_jax.make_scenario(
-        effort.scenario, "probe" if job.tiny else backend
-    )
+    backend = "probe" if job.tiny else backend
+    scenario = rewire_jax.make_scenario(job.effort.scenario, backend)
     environment, task = scenario.environment, scenario.tasks[0].data
     assert isinstance(environment, Environment)
     counts = (2, 4) if job.tiny else ENVIRONMENTS
     loops = dict(compiled_loops(environment, task, counts))
-    timings = in_turn(loops, effort.rounds, effort.seconds)
+    timings = in_turn(loops, job.effort.rounds, job.effort.seconds)
     rows: list[Row] = []
     for count, timing in timings.items():
-        row = {"backend": scenario.backend, "count": count}
+        row = {"backend": backend, "count": count}
         row["steps_per_second"] = count * timing.best
         rows.append(row | timing.figures())
     return {"rows": rows}
@@ -195,14 +190,14 @@ def count_kernels(policy: str, job: Accelerator) -> dict[str, Any]:
     state, advance, batches = updates(settings)
     programs = {"updates": jax.jit(advance).lower(state, batches, 64).compile()}
     probe = rewire_jax.make_scenario("probe/reach")
-    changed = {"scenario": probe.name, "backend": probe.backend, "tasks": 2}
-    plan = prepare(replace(settings, **changed), probe)
+    settings = replace(settings, scenario=probe.name, backend=probe.backend, tasks=2)
+    plan = prepare(settings, probe)
     program, members = plan.program, plan.stacked
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     began = jax.eval_shape(program.init, members), jnp.ones(1, bool), 0, task
     shapes = program.state_shape(members, *began)
-    chunk = program.chunk.lower(members, shapes, 0, task, 0, 1)  # type: ignore
-    programs["chunk"] = chunk.compile()
+    lowered = program.chunk.lower(members, shapes, 0, task, 0, 1)  # type: ignore
+    programs["chunk"] = lowered.compile()
     rows = [
         {"policy": policy, "program": name} | row
         for name, compiled in programs.items()
@@ -219,17 +214,20 @@ def waiting(job: Accelerator) -> dict[str, Any]:
             loop = update_loop(replace(job.settings(method), seeds=members))
             count = repetitions(loop, job.effort.seconds)
             row = {"policy": policy, "members": members, "updates": count}
-            rows.append(row | profile(lambda loop=loop, count=count: loop(count)))
+            rows.append(row | profile(functools.partial(loop, count)))
     return {"rows": rows}
+
+
+def blocks(job: Accelerator) -> dict[str, Any]:
+    """Times of the permutation's gradient in its scores, by its blocks."""
+    return {"rows": permutation.block_times(job.effort)}
 
 
 def train(method: str, job: Accelerator) -> dict[str, Any]:
     """Trains a population on the first task until the time is over, or to the end."""
     settings = replace(job.settings(method), tasks=1, seeds=10)
     if job.tiny:
-        settings = replace(
-            settings, seeds=2, eval_episodes=2, selection_episodes=2, checkpoint_every=0
-        )
+        settings = replace(settings, seeds=2, eval_episodes=2, selection_episodes=2)
     folder = job.work / f"{job.folder.name}-train-{method}"
     scenario = rewire_jax.make_scenario(settings.scenario, settings.backend)
     run = suite.Run(folder, scenario, settings)
@@ -247,10 +245,8 @@ def train(method: str, job: Accelerator) -> dict[str, Any]:
     copy = job.folder / f"train-{method}"
     copy.mkdir(exist_ok=True)
     for name in (run_folder.HEADER, *run_folder.TABLES):
-        if (folder / name).exists():
-            shutil.copy(folder / name, copy)
-    table = folder / "timing.jsonl"
-    lines = table.read_text().splitlines() if table.exists() else []
+        shutil.copy(folder / name, copy)
+    lines = (copy / "timing.jsonl").read_text().splitlines()
     return {"rows": [*map(json.loads, lines)], "finished": run.finished}
 
 
@@ -262,7 +258,7 @@ def steps() -> dict[str, Step]:
         **{f"tests-{k}": Step(420, part(tests, files)) for k, files in TESTS.items()},
         **{
             f"updates-{policy}-{width}": Step(240, part(update_rates, policy, width))
-            for width in WIDTHS
+            for width in (256, 1024)
             for policy in METHODS
         },
         **{
@@ -271,7 +267,7 @@ def steps() -> dict[str, Step]:
         },
         **{f"kernels-{name}": Step(120, part(count_kernels, name)) for name in METHODS},
         "waiting": Step(180, waiting),
-        "blocks": Step(180, lambda job: {"rows": permutation.block_times(job.effort)}),
+        "blocks": Step(180, blocks),
         **{f"train-{name}": Step(240, part(train, name)) for name in TRAINED},
     }
 

@@ -1,14 +1,16 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import pytest
 
 import rewire_jax
-from experiments import accelerator
+from experiments import accelerator, suite
 from experiments.accelerator import Accelerator
 from experiments.speed.kernels import idle, kernels, loops
 from rewire_jax.core.errors import UserError
+from rewire_jax.storage import run_folder
 
 PROGRAM = """HloModule jit_f, entry_computation_layout={(f32[2]{0})->f32[2]{0}}
 
@@ -136,10 +138,13 @@ def test_training_that_was_stopped_goes_on(tmp_path, monkeypatch):
         resumed.append(resume)
         folder.mkdir(exist_ok=True)
         (folder / "settings.json").write_text("{}")
-        (folder / "timing.jsonl").write_text('{"seconds": 1.0}\n' * len(resumed))
+        for table in run_folder.TABLES:
+            (folder / table).write_text('{"seconds": 1.0}\n' * len(resumed))
         raise rewire_jax.Stopped("stopped")
 
     monkeypatch.setattr(rewire_jax, "train", train)
+    unfinished = SimpleNamespace(complete=False)
+    monkeypatch.setattr(suite, "read_run", lambda folder: unfinished)
     job = Accelerator(tiny=True, out=tmp_path / "out", work=tmp_path, limit="9m")
     job = replace(job, only=("train-ft1",), measure="train-ft1")
     job.folder.mkdir()
@@ -149,7 +154,8 @@ def test_training_that_was_stopped_goes_on(tmp_path, monkeypatch):
         result = json.loads((job.folder / "train-ft1.json").read_text())
         assert result["rows"] == [{"seconds": 1.0}] * number
     assert resumed == [False, True]
-    assert (job.folder / "train-ft1" / "timing.jsonl").exists()
+    copied = {path.name for path in (job.folder / "train-ft1").iterdir()}
+    assert copied == {"settings.json", *run_folder.TABLES}
 
 
 @pytest.mark.slow
