@@ -31,7 +31,8 @@ from experiments import suite
 from experiments.speed import permutation
 from experiments.speed.environments import compiled_loops
 from experiments.speed.kernels import kernels, profile
-from experiments.speed.part import Effort
+from experiments.speed.loops import whole_loop
+from experiments.speed.part import Effort, on_probe
 from experiments.speed.timing import Loop, in_turn, repetitions
 from experiments.speed.updates import METHODS, update_loop, updates
 from experiments.suite import Row
@@ -189,9 +190,7 @@ def count_kernels(policy: str, job: Accelerator) -> dict[str, Any]:
     settings = job.settings(METHODS[policy])
     state, advance, batches = updates(settings)
     programs = {"updates": jax.jit(advance).lower(state, batches, 64).compile()}
-    probe = rewire_jax.make_scenario("probe/reach")
-    settings = replace(settings, scenario=probe.name, backend=probe.backend, tasks=2)
-    plan = prepare(settings, probe)
+    plan = prepare(on_probe(settings))
     program, members = plan.program, plan.stacked
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
     began = jax.eval_shape(program.init, members), jnp.ones(1, bool), 0, task
@@ -207,13 +206,14 @@ def count_kernels(policy: str, job: Accelerator) -> dict[str, Any]:
 
 
 def waiting(job: Accelerator) -> dict[str, Any]:
-    """Share of the time of updates in which a GPU has nothing to do."""
+    """Share of the time in which a GPU has nothing to do, in training on a probe."""
     rows: list[Row] = []
     for policy, method in METHODS.items():
         for members in (1, 2) if job.tiny else (1, 32):
-            loop = update_loop(replace(job.settings(method), seeds=members))
+            settings = on_probe(replace(job.settings(method), seeds=members))
+            loop = whole_loop(settings)
             count = repetitions(loop, job.effort.seconds)
-            row = {"policy": policy, "members": members, "updates": count}
+            row = {"policy": policy, "members": members, "steps": count}
             rows.append(row | profile(functools.partial(loop, count)))
     return {"rows": rows}
 

@@ -23,7 +23,8 @@ _LARGEST = 4  # the least common multiple of the published delays
 def group_size(count: int, settings: SacSettings) -> int:
     """Returns the size of the groups in rounds of `count` updates; 1 for no groups.
 
-    A CPU does not wait at a branch, and groups take longer to compile.
+    A CPU does not wait at a branch. There, groups take longer to compile, and change
+    results by rounding, because XLA fuses other operations.
     """
     if jax.default_backend() == "cpu":
         return 1
