@@ -56,14 +56,22 @@ def updates(
       group: 1, or a multiple of both delays, see `group_size`.
     """
 
+    def one(index, made, carry):
+        draw = jax.tree.map(lambda x: x[index], draws)
+        return sac.update(*carry, batch(index), draw, made, method, settings)
+
     def several(number, carry):
         for place in range(group):
-            index = group * number + place
-            draw = jax.tree.map(lambda x, index=index: x[index], draws)
-            made = first + number if group == 1 else place
-            carry = sac.update(*carry, batch(index), draw, made, method, settings)
+            carry = one(group * number + place, place, carry)
         return carry
 
     draw = jax.tree.map(lambda x: x[0], draws)
     metrics = sac.first_metrics(learner, batch(0), draw, method, settings)
-    return jax.lax.fori_loop(0, count // group, several, (learner, metrics))
+    if group > 1:
+        return jax.lax.fori_loop(0, count // group, several, (learner, metrics))
+    return jax.lax.fori_loop(
+        0,
+        count,
+        lambda number, carry: one(number, first + number, carry),
+        (learner, metrics),
+    )

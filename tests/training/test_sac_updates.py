@@ -64,21 +64,21 @@ def test_groups_make_the_same_operations():
 
 @pytest.fixture
 def compiled(monkeypatch):
-    """`group -> program` of Rewire, whatever the device."""
+    """`group -> program` of FT-1, whatever the device."""
 
     def build(group):
         monkeypatch.setattr(sac_updates, "group_size", lambda *_: group)
         # Equal to no other, or the program of another group would be taken.
-        make = functools.partial(find_method("rewire").make)
+        make = functools.partial(find_method("ft1").make)
         shape = SHAPE._replace(updates=UPDATES)
         of = MemberFunctions(SCENARIO.environment, make, SPEC, shape)
-        return compiled_functions.build(of, options("rewire", 0), MESH)
+        return compiled_functions.build(of, options("ft1", 0), MESH)
 
     return build
 
 
 def test_groups_are_compiled_without_branches(compiled):
-    members = crowd("rewire")
+    members = crowd()
     members = members._replace(sac=dataclasses.replace(members.sac, **DELAYS))
     made, branches = {}, {}
     for group in (1, GROUP):
