@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
@@ -57,8 +58,9 @@ def updates(
     """
 
     def one(index, made, carry):
+        learner, metrics = carry
         draw = jax.tree.map(lambda x: x[index], draws)
-        return sac.update(*carry, batch(index), draw, made, method, settings)
+        return sac.update(learner, metrics, batch(index), draw, made, method, settings)
 
     def several(number, carry):
         for place in range(group):
@@ -66,7 +68,7 @@ def updates(
         return carry
 
     draw = jax.tree.map(lambda x: x[0], draws)
-    metrics = sac.first_metrics(learner, batch(0), draw, method, settings)
+    metrics = sac.first_metrics(learner, batch(jnp.asarray(0)), draw, method, settings)
     if group > 1:
         return jax.lax.fori_loop(0, count // group, several, (learner, metrics))
     return jax.lax.fori_loop(
