@@ -209,7 +209,7 @@ def waiting(job: Accelerator) -> dict[str, Any]:
     """Share of the time in which a GPU has nothing to do, in training on a probe."""
     rows: list[Row] = []
     for policy, method in METHODS.items():
-        for members in (1, 2) if job.tiny else (1, 32):
+        for members in (1,) if job.tiny else (1, 32):
             settings = on_probe(replace(job.settings(method), seeds=members))
             loop = whole_loop(settings)
             count = repetitions(loop, job.effort.seconds)
