@@ -40,6 +40,12 @@ class Effort:
         return replace(settings, sac=replace(settings.sac, **sac))
 
 
+def on_probe(settings: Settings) -> Settings:
+    """The same on a probe, whose own steps cost next to nothing."""
+    probe = make_scenario("probe/reach")
+    return replace(settings, scenario=probe.name, backend=probe.backend, tasks=2)
+
+
 class Part(NamedTuple):
     """A part: how it is measured and shown.
 

@@ -1,5 +1,6 @@
 """The permutation, forward and backward, over its dense straight-through form."""
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -10,11 +11,13 @@ from experiments.speed.part import Effort, Part
 from experiments.speed.timing import Loop, in_turn
 from experiments.suite import Row, show
 from rewire_jax.nn.permutation import permute
+from rewire_jax.nn.softsort_vjp import score_gradient
 from rewire_jax.reports import plots
 
 BATCH = 256
 TAU = 1.0
 WIDTHS = (128, 256, 512, 1024, 2048, 4096)
+BLOCKS = (32, 64, 128, 256, 512, 1024)
 Permute = Callable[[jax.Array, jax.Array, float], jax.Array]
 
 
@@ -69,6 +72,43 @@ def measure(effort: Effort) -> list[Row]:
         row["faster"] = timings["permute"].over(timings["dense"])
         rows.append(row)
     return rows
+
+
+def block_times(effort: Effort) -> list[Row]:
+    """Milliseconds of the gradient in the scores, by the places in its blocks."""
+    rows = []
+    for width in (16,) if effort.quick else (256, 1024):
+        for members in (1, 2) if effort.quick else (1, 32):
+            keys = jax.random.split(jax.random.key(0), 3)
+            shape = members, BATCH, width
+            gradients, values = (jax.random.normal(key, shape) for key in keys[:2])
+            scores = jnp.sort(jax.random.uniform(keys[2], (members, width)))
+            start = gradients, values, scores
+            blocks = (4, 16) if effort.quick else [n for n in BLOCKS if n <= width]
+            loops: dict[int, Loop] = {
+                block: functools.partial(block_loop(block), start) for block in blocks
+            }
+            timings = in_turn(loops, effort.rounds, effort.seconds / 2)
+            for block, timing in timings.items():
+                row: Row = {"hidden": width, "members": members, "block": block}
+                rows.append(row | {"ms": 1e3 / timing.best} | timing.figures())
+    return rows
+
+
+def block_loop(block: int) -> Callable[..., jax.Array]:
+    """`(arrays, count) -> scores [members, n]`, so many steps along the gradient."""
+
+    def steps(arrays, count):
+        gradient, values, scores = arrays
+
+        def once(_, scores):
+            tau = jnp.asarray(TAU)
+            made = score_gradient([gradient], [values], scores, tau, block, axis=1)
+            return scores - 1e-9 * made
+
+        return jax.lax.fori_loop(0, count, once, scores)
+
+    return jax.jit(jax.vmap(steps, (0, None)))
 
 
 def draw(axes: Axes, rows: list[Row]) -> None:

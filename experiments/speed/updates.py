@@ -16,7 +16,7 @@ from rewire_jax.core.transition import Batch
 from rewire_jax.methods import find_method
 from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
-from rewire_jax.training import sac
+from rewire_jax.training import sac, sac_updates
 from rewire_jax.training.run_setup import prepare
 
 METHODS = {"plain": "ft1", "rewire": "rewire"}
@@ -71,8 +71,12 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
             key, first = jax.random.fold_in(member.keys, number), number * drawn
             draws = jax.vmap(draw)(jax.random.split(key, drawn))
             made = jnp.minimum(drawn, count - first)
+            # At most 2, and `repetitions` gives even counts.
+            group = sac_updates.group_size(drawn, member.sac)
             numbers = draws, batch, first, made
-            learner, metrics = sac.updates(learner, *numbers, method, member.sac)
+            learner, metrics = sac_updates.updates(
+                learner, *numbers, method, member.sac, group
+            )
             latest = Round(first, first + drawn, metrics)
             return learner.with_learned(
                 method.after_round(learner.params, learner.method_state, latest)

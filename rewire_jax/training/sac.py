@@ -1,7 +1,6 @@
 """Soft Actor-Critic: losses and one update, for one member."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -259,6 +258,8 @@ def _every(delay, count, change, keep, value):
     """Changes a value in every `delay`-th update only."""
     if delay == 1:  # a branch would copy
         return change(value)
+    if isinstance(count, int):
+        return keep(value) if count % delay else change(value)
     return jax.lax.cond(count % delay == 0, change, keep, value)
 
 
@@ -267,7 +268,7 @@ def update(
     metrics: Metrics,
     batch: Batch,
     draw: UpdateNoise,
-    count: jax.Array,
+    count: jax.Array | int,
     method: Method,
     sac: SacSettings,
 ) -> tuple[TrainState, Metrics]:
@@ -279,7 +280,8 @@ def update(
       batch: `[batch, ...]` transitions.
       draw: the random draws.
       count: `[]` int, updates made before in this task; shared by all members, so that
-        delayed updates stay branches (`cond`) under vmap.
+        delayed updates stay branches (`cond`) under vmap. A Python int decides on
+        them when it is traced; see `sac_updates`.
       method: the method.
       sac: SAC's settings.
     """
@@ -315,34 +317,3 @@ def update(
         target=target,
         optimizers=(policy_state, critic_state, temperature_state),
     ), policy | {"critic_loss": loss, "q": q}
-
-
-def updates(
-    learner: TrainState,
-    draws: UpdateNoise,
-    batch: Callable[[jax.Array], Batch],
-    first: jax.Array | int,
-    count: jax.Array | int,
-    method: Method,
-    sac: SacSettings,
-) -> tuple[TrainState, Metrics]:
-    """Makes several updates; also returns the metrics of the last one.
-
-    Args:
-      learner: the member's learner.
-      draws: `[count]` or more on every leaf.
-      batch: `number -> Batch`, the transitions of an update.
-      first: `[]` int, updates made before in this task, see `update`.
-      count: `[]` int, number of updates to make.
-      method: the method.
-      sac: SAC's settings.
-    """
-
-    def one(number, carry):
-        learner, metrics = carry
-        draw, made = jax.tree.map(lambda x: x[number], draws), first + number
-        return update(learner, metrics, batch(number), draw, made, method, sac)
-
-    draw = jax.tree.map(lambda x: x[0], draws)
-    metrics = first_metrics(learner, batch(jnp.asarray(0)), draw, method, sac)
-    return jax.lax.fori_loop(0, count, one, (learner, metrics))

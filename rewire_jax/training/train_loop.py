@@ -22,6 +22,7 @@ from rewire_jax.training import (
     replay_buffer,
     rollout,
     sac,
+    sac_updates,
 )
 from rewire_jax.training.loop_state import (
     ChunkMetrics,
@@ -185,8 +186,9 @@ def update_from_buffer(
         def fresh_batch(key):
             return replay_buffer.sample(buffer, key, time, size[0], length)
 
-        learner, metrics = sac.updates(
-            learner, draws, batch, first, updates, method, settings
+        group = sac_updates.group_size(updates, settings)
+        learner, metrics = sac_updates.updates(
+            learner, draws, batch, first, updates, method, settings, group
         )
         made = Round(first, first + updates, metrics)
         if settings.redo_every:

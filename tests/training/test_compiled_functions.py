@@ -14,6 +14,7 @@ from rewire_jax.core.machine_memory import machine_bytes
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage.run_results import read_run
+from rewire_jax.training import sac_updates
 from rewire_jax.training.memory_estimate import size
 from rewire_jax.training.run_setup import prepare
 from tests.tiny import tiny
@@ -85,7 +86,10 @@ def state(plan):
 @pytest.fixture(scope="module")
 def lowered(plan, state):
     task = jax.tree.map(lambda leaf: leaf[0], plan.tasks)
-    return plan.program.chunk.lower(plan.stacked, state, 0, task, 0, 10)
+    with pytest.MonkeyPatch.context() as forced:
+        # On a GPU, too, with branches.
+        forced.setattr(sac_updates, "group_size", lambda *_: 1)
+        return plan.program.chunk.lower(plan.stacked, state, 0, task, 0, 10)
 
 
 @pytest.fixture(scope="module")
