@@ -27,6 +27,7 @@ def nothing(count):
     time.sleep(1e-4 * count)
 
 
+@pytest.mark.slow
 def test_updates_are_measured_against_products(tmp_path, capsys):
     rows = {row["loop"]: row for row in quick(tmp_path / "new", "updates")["updates"]}
     plain = {"square", "shapes", "plain/2"}

@@ -21,6 +21,7 @@ def row(members, seconds, processor):
     return facts | times | sizes | compiling
 
 
+@pytest.mark.slow
 def test_estimate_is_near_what_is_planned():
     row = population.measure(SMALL, 2)
     assert min(row.values()) > 0

@@ -21,6 +21,7 @@ SETTINGS = SacSettings(
     hidden=SPEC.hidden, depth=SPEC.depth, batch_size=8, redo_every=10
 )
 KEY = jax.random.key(5)
+REPORTING = "rewire", "csp", "pnn", "reset_distill"  # a policy of their own kind
 DEAD = {"critic": [(0, 0, 2), (0, 1, 2), (1, 1, 4)], "policy": [(0, 1), (1, 3)]}
 """Critic, layer and neuron; and those of the policy."""
 
@@ -131,7 +132,9 @@ def equal(one, other):
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
-@pytest.mark.parametrize("name", ["ft1", "ewc", "rewire"])
+@pytest.mark.parametrize(
+    "name", ["ft1", pytest.param("ewc", marks=pytest.mark.slow), "rewire"]
+)
 def test_exactly_the_dead_neurons_are_reset(name):
     method, learner = prepared(name)
     after = redo(learner, method, 8, 12)
@@ -212,7 +215,13 @@ def test_a_key_for_resets_leaves_the_others_as_they_were():
         equal(jax.random.key_data(one), jax.random.key_data(other))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in REPORTING else pytest.mark.slow)
+        for name in METHODS
+    ],
+)
 def test_every_method_reports_its_policy_in_training(name):
     network = "layer_norm"
     method = make(name, network)
