@@ -80,7 +80,7 @@ def report(results: Mapping[str, Any], folder: Path) -> str:
             plots.entitle(figure, title, how["device"])
             figure.savefig(folder / f"{name}.png")
             lines += [f"![{title}]({name}.png)", ""]
-        lines += [part.reading, ""]
+        lines += [result["reading"], ""]
         took = f"in {result['seconds']:.0f} s, load {load[0]:.1f} to {load[1]:.1f}"
         lines += [f"Measured {took}, on {how_made(how)}."]
     return "\n".join(lines) + "\n"
@@ -115,6 +115,8 @@ def run(bench: Bench) -> dict[str, Any]:
             "seconds": time.perf_counter() - began,
             "load": [before, os.getloadavg()[0]],
             "rounds": effort.rounds,
+            # What was measured then, whatever is measured now.
+            "reading": PARTS[name].reading,
             "provenance": run_folder.provenance(),
         }
         run_folder.write(path, found)

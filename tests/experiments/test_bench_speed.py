@@ -45,10 +45,13 @@ def test_updates_are_measured_against_products(tmp_path, capsys):
 def test_a_part_is_measured_anew_and_the_others_are_kept(tmp_path):
     kept = {"rows": [{"loop": "kept", "best": 2.0}], "seconds": 1.0, "load": [0.0, 0.0]}
     kept |= {"rounds": 1, "provenance": run_folder.provenance()}
+    kept |= {"reading": "As it was read then."}
     run_folder.write(tmp_path / "result.json", {"updates": kept})
     rows = quick(tmp_path, "permutation")
     assert rows["updates"] == kept["rows"]
-    assert "`kept`" in (tmp_path / "report.md").read_text()
+    report = (tmp_path / "report.md").read_text()
+    assert "`kept`" in report
+    assert "As it was read then." in report
 
 
 def test_an_unknown_part_is_refused(tmp_path):
