@@ -32,6 +32,7 @@ DELAYS = {"policy_delay": 4, "target_delay": 2}
 GROUP, UPDATES, STEPS = 4, 8, WARMUP + 4
 
 
+@pytest.mark.slow
 def test_groups_make_the_same_operations():
     settings = dataclasses.replace(PLAIN, **DELAYS)
     method = find_method("ft1").make(SPEC, options("ft1", 0))
