@@ -124,7 +124,11 @@ def test_a_heavy_torso_is_slower_to_move():
 
 
 @pytest.mark.parametrize(
-    ("domain", "factor", "slope"), [("halfcheetah", 0.4, 0.3), ("ant", 0.375, 0.7)]
+    ("domain", "factor", "slope"),
+    [
+        ("halfcheetah", 0.4, 0.3),
+        pytest.param("ant", 0.375, 0.7, marks=pytest.mark.slow),
+    ],
 )
 def test_less_friction_slides_further_down_a_slope(domain, factor, slope):
     def slide(friction):

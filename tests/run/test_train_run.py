@@ -95,7 +95,15 @@ def test_a_run_may_be_older_than_a_setting(run: Path, tmp_path: Path) -> None:
             train_run.train(dataclasses.replace(tiny(), sac=sac), copy, resume=True)
 
 
-@pytest.mark.parametrize(("chunks", "damaged"), [(7, 1), (7, 2), (4, 1), (1, 0)])
+@pytest.mark.parametrize(
+    ("chunks", "damaged"),
+    [
+        (7, 2),
+        (1, 0),
+        pytest.param(7, 1, marks=pytest.mark.slow),
+        pytest.param(4, 1, marks=pytest.mark.slow),
+    ],
+)
 def test_a_damaged_checkpoint_falls_back_to_the_one_before(
     run: Path,
     tmp_path: Path,

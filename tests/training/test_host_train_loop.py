@@ -29,7 +29,7 @@ def close(one, other):
     ("method", "color"),
     [
         ("ft1", 1.0),
-        ("csp", 0.0),
+        pytest.param("csp", 0.0, marks=pytest.mark.slow),
         pytest.param("ft1", 0.0, marks=pytest.mark.slow),
         pytest.param("rewire", 0.0, marks=pytest.mark.slow),
     ],
