@@ -6,7 +6,7 @@ task after each later task acts again.
 """
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment
 from rewire_jax.reports import plots
 from rewire_jax.reports.campaign_data import read_campaign_data
+from rewire_jax.run.policies import Policies
 from rewire_jax.training.acting import Act
 
 NOTES = (
@@ -69,24 +70,44 @@ def change(before: jax.Array, after: jax.Array) -> jax.Array:
     return jnp.mean((after - before) ** 2) / jnp.mean(jnp.var(before, axis=0))
 
 
-def measure(folder: Path, scenario: rewire_jax.Scenario) -> list[dict[str, Any]]:
-    """A row for each task, each later task and each seed of a finished run.
+def measure(
+    folders: Sequence[Path], scenario: rewire_jax.Scenario
+) -> list[dict[str, Any]]:
+    """A row for each task, each later task and each seed.
+
+    Args:
+      folders: finished runs that differ only in their seeds.
+      scenario: of all of them.
 
     Raises:
       UserError: the host steps the environment.
     """
     environment = scenario.environment
     if isinstance(environment, HostEnvironment):
-        raise UserError(f"{folder}: use runs on compiled environments")
-    first = rewire_jax.load_policies(folder)
+        raise UserError(f"{folders[0]}: use runs on compiled environments")
+    # Compiled once: the runs act alike.
+    first = rewire_jax.load_policies(folders[0])
     act = jax.jit(first.act)
     play = jax.jit(partial(visited, environment, first.act))
-    stages = [
-        rewire_jax.load_policies(folder, stage=stage)
-        for stage in range(len(first.tasks))
-    ]
     rows = []
-    for seed in first.seeds:
+    for folder in folders:
+        stages = [
+            rewire_jax.load_policies(folder, stage=stage)
+            for stage in range(len(first.tasks))
+        ]
+        rows += _changes(stages, scenario, act, play)
+    return rows
+
+
+def _changes(
+    stages: Sequence[Policies],
+    scenario: rewire_jax.Scenario,
+    act: Act,
+    play: Callable[..., jax.Array],
+) -> list[dict[str, Any]]:
+    """The rows of one run; `stages` are its policies after each task."""
+    rows = []
+    for seed in stages[0].seeds:
         learned = [policies.member(seed) for policies in stages]
         for task in range(len(stages) - 1):
             states = play(learned[task], task, scenario.tasks[task].data)
@@ -94,7 +115,7 @@ def measure(folder: Path, scenario: rewire_jax.Scenario) -> list[dict[str, Any]]
             rows += [
                 {
                     "seed": seed,
-                    "task": first.tasks[task],
+                    "task": scenario.tasks[task].name,
                     "later": number,
                     "change": float(change(before, actions)),
                 }
@@ -152,14 +173,16 @@ def run(job: Kept) -> None:
       UserError: the campaign cannot be read, or no run with several tasks is finished.
     """
     data = read_campaign_data(job.file, job.runs)
-    rows = []
+    folders: dict[tuple[str, str, str], list[Path]] = {}
     for one in data.jobs:
-        settings = one.run.settings
-        if not one.done or settings.tasks < 2:
-            continue
-        scenario = rewire_jax.make_scenario(settings.scenario, settings.backend)
-        label = one.run.configuration
-        rows += [{"method": label} | row for row in measure(one.folder, scenario)]
+        made = one.run.settings
+        if one.done and made.tasks > 1:
+            key = one.run.configuration, made.scenario, made.backend
+            folders.setdefault(key, []).append(one.folder)
+    rows = []
+    for (label, name, backend), those in folders.items():
+        scenario = rewire_jax.make_scenario(name, backend)
+        rows += [{"method": label} | row for row in measure(those, scenario)]
     require(bool(rows), f"no run of {job.file} with several tasks is finished")
     title = f"Change of old policies' actions. {data.campaign.title}"
     out = job.out or suite.RESULTS / f"cached-actions-{job.file.stem}"
