@@ -28,7 +28,7 @@ from rewire_jax.training.acting import Act
 NOTES = (
     "Squared change of a policy's actions in the states that it visits in its own task "
     "right after its training, relative to their variance. 0: it acts as before. 2: as "
-    "another policy with actions of the same mean and variance. Mean, and lowest to "
+    "another policy with actions of the same mean and variance. Median, and lowest to "
     "highest, over tasks and seeds.",
 )
 
@@ -136,9 +136,9 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def _text(values: Sequence[float]) -> str:
-    """Mean and lowest to highest; the values may lie decades apart."""
+    """Median and lowest to highest; the values may lie decades apart."""
     low, high = min(values), max(values)
-    return f"{statistics.mean(values):.2g} ({low:.2g} to {high:.2g})"
+    return f"{statistics.median(values):.2g} ({low:.2g} to {high:.2g})"
 
 
 def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
@@ -148,16 +148,16 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
         later = sorted({row["later"] for row in own})
         values = [[row["change"] for row in own if row["later"] == n] for n in later]
         style = plots.look(i)
-        axes.plot(later, [statistics.mean(v) for v in values], **style, label=label)
+        axes.plot(later, [statistics.median(v) for v in values], **style, label=label)
         for n, each in zip(later, values, strict=True):
             axes.scatter([n] * len(each), each, color=style["color"], s=12)
     axes.set_xticks(sorted({row["later"] for row in rows}))
     axes.set_xlabel("later tasks")
     axes.set_ylabel("change of actions")
-    axes.set_ylim(0, None)
+    axes.set_yscale("log")
     axes.grid(axis="y", color="0.9")
     figure.legend(loc="outside right center", frameon=False)
-    plots.entitle(figure, title, "lines: mean; points: a task of a seed")
+    plots.entitle(figure, title, "lines: median; points: a task of a seed; 0 is not shown")
     figure.savefig(path)
 
 
