@@ -157,7 +157,9 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     axes.set_yscale("log")
     axes.grid(axis="y", color="0.9")
     figure.legend(loc="outside right center", frameon=False)
-    plots.entitle(figure, title, "lines: median; points: a task of a seed; 0 is not shown")
+    plots.entitle(
+        figure, title, "lines: median; points: a task of a seed; 0 is not shown"
+    )
     figure.savefig(path)
 
 
