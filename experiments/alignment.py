@@ -166,22 +166,24 @@ def policy_probe(job: Alignment, key: jax.Array, previous: Any):
     return change
 
 
+def means(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[Any, list[float]]:
+    """Means over seeds, one for each number of updates, by form and rate."""
+    found: dict[Any, list[float]] = {}
+    for place, own in suite.grouped(rows, "form", "rate", "updates").items():
+        mean = statistics.mean(row[measure] for row in own)
+        found.setdefault(place[:2], []).append(mean)
+    return found
+
+
 def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Means over seeds, a line for each form, rate and measure."""
     looks = sorted({row["updates"] for row in rows})
     lines = [["form", "adapter rate", "", *(f"{updates:,}" for updates in looks)]]
+    of = {measure: means(rows, measure) for measure in MEASURES}
     for form, rate in VARIANTS:
         for measure, (name, shown) in MEASURES.items():
-            line = [form, f"{rate}" if rate else "–", name]
-            for look in looks:
-                place = form, rate, look
-                own = [
-                    row[measure]
-                    for row in rows
-                    if (row["form"], row["rate"], row["updates"]) == place
-                ]
-                line.append(format(statistics.mean(own), shown))
-            lines.append(line)
+            cells = [format(mean, shown) for mean in of[measure][form, rate]]
+            lines.append([form, f"{rate}" if rate else "–", name, *cells])
     return lines
 
 
@@ -190,17 +192,9 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     figure, panels = plots.empty((11.0, 3.8), 1, len(MEASURES))
     looks = sorted({row["updates"] for row in rows})
     for axes, (measure, (name, _)) in zip(panels, MEASURES.items(), strict=True):
-        for i, (form, rate) in enumerate(VARIANTS):
-            means = [
-                statistics.mean(
-                    row[measure]
-                    for row in rows
-                    if (row["form"], row["rate"], row["updates"]) == (form, rate, look)
-                )
-                for look in looks
-            ]
+        for i, ((form, rate), values) in enumerate(means(rows, measure).items()):
             label = f"{form}, adapter rate {rate}" if rate else form
-            axes.plot(looks, means, marker=".", **plots.look(i), label=label)
+            axes.plot(looks, values, marker=".", **plots.look(i), label=label)
         axes.set_xscale("log")
         axes.set_xlabel("updates")
         axes.set_title(name, fontsize=11)

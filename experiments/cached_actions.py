@@ -51,11 +51,10 @@ class Kept:
 def visited(
     environment: Environment, act: Act, learned: Any, task: jax.Array, data: Any
 ) -> jax.Array:
-    """Observations `[steps, observations]` of one episode, up to its end."""
+    """Observations `[steps, observations]` of one episode; after its end, the last."""
 
     def step(state, _):
         after = environment.step(data, state, act(learned, task, state.observation))
-        # After its end an episode stays where it ended.
         after = jax.tree.map(
             lambda old, new: jnp.where(state.terminal, old, new), state, after
         )
@@ -71,13 +70,14 @@ def change(before: jax.Array, after: jax.Array) -> jax.Array:
 
 
 def measure(
-    folders: Sequence[Path], scenario: rewire_jax.Scenario
+    folders: Sequence[Path], scenario: rewire_jax.Scenario, tasks: int
 ) -> list[dict[str, Any]]:
     """A row for each task, each later task and each seed.
 
     Args:
       folders: finished runs that differ only in their seeds.
       scenario: of all of them.
+      tasks: number of their tasks.
 
     Raises:
       UserError: the host steps the environment.
@@ -85,25 +85,22 @@ def measure(
     environment = scenario.environment
     if isinstance(environment, HostEnvironment):
         raise UserError(f"{folders[0]}: use runs on compiled environments")
+    runs = [
+        [rewire_jax.load_policies(folder, stage=stage) for stage in range(tasks)]
+        for folder in folders
+    ]
     # Compiled once: the runs act alike.
-    first = rewire_jax.load_policies(folders[0])
-    act = jax.jit(first.act)
-    play = jax.jit(partial(visited, environment, first.act))
-    rows = []
-    for folder in folders:
-        stages = [
-            rewire_jax.load_policies(folder, stage=stage)
-            for stage in range(len(first.tasks))
-        ]
-        rows += _changes(stages, scenario, act, play)
-    return rows
+    act = runs[0][0].act
+    play = jax.jit(partial(visited, environment, act))
+    changes = partial(_changes, scenario, jax.jit(act), play)
+    return [row for stages in runs for row in changes(stages)]
 
 
 def _changes(
-    stages: Sequence[Policies],
     scenario: rewire_jax.Scenario,
     act: Act,
     play: Callable[..., jax.Array],
+    stages: Sequence[Policies],
 ) -> list[dict[str, Any]]:
     """The rows of one run; `stages` are its policies after each task."""
     rows = []
@@ -128,10 +125,10 @@ def table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """For people: a line for each configuration."""
     numbers = sorted({row["later"] for row in rows})
     lines = [["method", *(f"{n} later" for n in numbers), "seeds"]]
-    for label, own in _by_label(rows).items():
-        cells = [[row["change"] for row in own if row["later"] == n] for n in numbers]
-        seeds = len({row["seed"] for row in own})
-        lines.append([label, *map(_text, cells), str(seeds)])
+    for (label,), own in suite.grouped(rows, "method").items():
+        later = suite.grouped(own, "later")
+        cells = [_text([row["change"] for row in later[n,]]) for n in numbers]
+        lines.append([label, *cells, str(len({row["seed"] for row in own}))])
     return lines
 
 
@@ -144,12 +141,13 @@ def _text(values: Sequence[float]) -> str:
 def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     """Writes the picture: change against the number of later tasks."""
     figure, (axes,) = plots.empty((7.0, 4.2), 1, 1)
-    for i, (label, own) in enumerate(_by_label(rows).items()):
-        later = sorted({row["later"] for row in own})
-        values = [[row["change"] for row in own if row["later"] == n] for n in later]
+    for i, ((label,), own) in enumerate(suite.grouped(rows, "method").items()):
+        later = suite.grouped(own, "later")
+        numbers = [number for (number,) in later]
+        values = [[row["change"] for row in each] for each in later.values()]
         style = plots.look(i)
-        axes.plot(later, [statistics.median(v) for v in values], **style, label=label)
-        for n, each in zip(later, values, strict=True):
+        axes.plot(numbers, [statistics.median(v) for v in values], **style, label=label)
+        for n, each in zip(numbers, values, strict=True):
             axes.scatter([n] * len(each), each, color=style["color"], s=12)
     axes.set_xticks(sorted({row["later"] for row in rows}))
     axes.set_xlabel("later tasks")
@@ -163,11 +161,6 @@ def draw(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     figure.savefig(path)
 
 
-def _by_label(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    labels = dict.fromkeys(row["method"] for row in rows)
-    return {name: [row for row in rows if row["method"] == name] for name in labels}
-
-
 def run(job: Kept) -> None:
     """Measures all finished runs and writes the result.
 
@@ -175,16 +168,16 @@ def run(job: Kept) -> None:
       UserError: the campaign cannot be read, or no run with several tasks is finished.
     """
     data = read_campaign_data(job.file, job.runs)
-    folders: dict[tuple[str, str, str], list[Path]] = {}
+    folders: dict[tuple[str, str, str, int], list[Path]] = {}
     for one in data.jobs:
         made = one.run.settings
         if one.done and made.tasks > 1:
-            key = one.run.configuration, made.scenario, made.backend
+            key = one.run.configuration, made.scenario, made.backend, made.tasks
             folders.setdefault(key, []).append(one.folder)
     rows = []
-    for (label, name, backend), those in folders.items():
+    for (label, name, backend, tasks), those in folders.items():
         scenario = rewire_jax.make_scenario(name, backend)
-        rows += [{"method": label} | row for row in measure(those, scenario)]
+        rows += [{"method": label} | row for row in measure(those, scenario, tasks)]
     require(bool(rows), f"no run of {job.file} with several tasks is finished")
     title = f"Change of old policies' actions. {data.campaign.title}"
     out = job.out or suite.RESULTS / f"cached-actions-{job.file.stem}"

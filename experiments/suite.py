@@ -5,7 +5,7 @@ command until everything is finished. Experiments use each other's runs.
 """
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -208,6 +208,16 @@ def origins(made: Sequence[Report[Comparison]]) -> list[str]:
         lines += [f"- {report.title}", *(f"  - **{note}**" for note in report.notes)]
         lines += [f"  {line}" for line in report.origins]
     return lines
+
+
+def grouped(
+    rows: Iterable[Mapping[str, Any]], *names: str
+) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Rows by their values of these columns, in the order of the first of each."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
 
 
 def write(

@@ -118,15 +118,12 @@ def evaluated(job: TaskChoice, run: RunData) -> list[dict[str, Any]]:
 def means(rows: Sequence[Mapping[str, Any]]) -> list[suite.Row]:
     """Means over tasks and seeds, a row for each kind of run and each choice."""
     names = ("scenario", "run", "trial_steps", "trials")
-    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in names), []).append(row)
     measures = ("labelled", *CHOSEN)
     return [
         dict(zip(names, key, strict=True))
         | {name: statistics.mean(row[name] for row in group) for name in measures}
         | {"seeds": len({row["seed"] for row in group})}
-        for key, group in groups.items()
+        for key, group in suite.grouped(rows, *names).items()
     ]
 
 

@@ -251,6 +251,21 @@ def flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
+def require_counts(group: Any, *names: str) -> None:
+    """Raises `UserError` unless each of these values of a dataclass is at least 1."""
+    for name in names:
+        value = getattr(group, name)
+        require(value >= 1, f"{flag(name)} must be at least 1, not {value}")
+
+
+def require_weights(group: Any, *names: str) -> None:
+    """Raises `UserError` unless each of these values is at least 0 and finite."""
+    for name in names:
+        value = getattr(group, name)
+        fits = 0 <= value < math.inf
+        require(fits, f"{flag(name)} must be at least 0 and finite, not {value}")
+
+
 def check_kinds(group: Any) -> None:
     """Raises `UserError` if a value of a dataclass has the wrong type."""
     for name, kind in typing.get_type_hints(type(group)).items():

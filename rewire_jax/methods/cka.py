@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from rewire_jax.core.pytrees import count
-from rewire_jax.core.settings import require, settings
+from rewire_jax.core.settings import require_counts, settings
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
@@ -33,7 +33,7 @@ class CkaSettings:
 
     def checked(self) -> "CkaSettings":
         """Returns the settings; `UserError` if one is invalid."""
-        require(self.pool >= 1, f"--pool must be at least 1, not {self.pool}")
+        require_counts(self, "pool")
         return self
 
 

@@ -10,7 +10,12 @@ import jax.numpy as jnp
 import optax
 
 from rewire_jax.core.pytrees import at, count
-from rewire_jax.core.settings import require, settings
+from rewire_jax.core.settings import (
+    require,
+    require_counts,
+    require_weights,
+    settings,
+)
 from rewire_jax.methods import cloning
 from rewire_jax.methods.base import Candidates, Method
 from rewire_jax.methods.spec import Spec
@@ -46,13 +51,8 @@ class ClonexSettings:
 
     def checked(self) -> "ClonexSettings":
         """Returns the settings; `UserError` if one is invalid."""
-        for name in ("states", "batch", "head_slots"):
-            value, flag = getattr(self, name), name.replace("_", "-")
-            require(value >= 1, f"--{flag} must be at least 1, not {value}")
-        require(
-            0 <= self.coefficient < jnp.inf,
-            f"--coefficient must be at least 0 and finite, not {self.coefficient}",
-        )
+        require_counts(self, "states", "batch", "head_slots")
+        require_weights(self, "coefficient")
         require(
             0 <= self.explore < 1, f"--explore must lie in [0, 1), not {self.explore}"
         )

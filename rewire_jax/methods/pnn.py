@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
-from rewire_jax.core.settings import require, settings
+from rewire_jax.core.settings import require_counts, settings
 from rewire_jax.methods.base import Act, Method
 from rewire_jax.methods.shared import Shared
 from rewire_jax.methods.spec import Spec
@@ -41,7 +41,7 @@ class PnnSettings:
 
     def checked(self) -> "PnnSettings":
         """Returns the settings; `UserError` if one is invalid."""
-        require(self.width >= 1, f"--width must be at least 1, not {self.width}")
+        require_counts(self, "width")
         return self
 
 

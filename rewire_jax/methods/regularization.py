@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import count
-from rewire_jax.core.settings import require, settings
+from rewire_jax.core.settings import require_counts, require_weights, settings
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.finetune import FinetuneSettings, ft1
 from rewire_jax.methods.spec import Spec
@@ -31,7 +31,7 @@ class FtL2Settings:
 
     def checked(self) -> "FtL2Settings":
         """Returns the settings; `UserError` if one is invalid."""
-        _check_coefficient(self.coefficient)
+        require_weights(self, "coefficient")
         return self
 
 
@@ -51,19 +51,9 @@ class EwcSettings:
 
     def checked(self) -> "EwcSettings":
         """Returns the settings; `UserError` if one is invalid."""
-        _check_coefficient(self.coefficient)
-        require(
-            self.fisher_states >= 1,
-            f"--fisher-states must be at least 1, not {self.fisher_states}",
-        )
+        require_weights(self, "coefficient")
+        require_counts(self, "fisher_states")
         return self
-
-
-def _check_coefficient(value: float) -> None:
-    require(
-        0 <= value < jnp.inf,
-        f"--coefficient must be at least 0 and finite, not {value}",
-    )
 
 
 # Scenario: coefficient of FT-L2, of EWC. Published with the authors' code.

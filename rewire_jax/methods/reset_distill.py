@@ -12,7 +12,12 @@ import jax.numpy as jnp
 import optax
 
 from rewire_jax.core.pytrees import at, count, tile
-from rewire_jax.core.settings import flag, require, settings
+from rewire_jax.core.settings import (
+    require,
+    require_counts,
+    require_weights,
+    settings,
+)
 from rewire_jax.methods import cloning
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.finetune import FinetuneSettings, ft1
@@ -47,9 +52,10 @@ class ResetDistillSettings:
 
     def checked(self) -> "ResetDistillSettings":
         """Returns the settings; `UserError` if one is invalid."""
-        for name, value in vars(self).items():
-            fits = value >= 0 if name == "coefficient" else value > 0
-            require(fits, f"{flag(name)} is too small: {value}")
+        require_counts(self, "states", "batch", "distill_updates", "head_slots")
+        require_weights(self, "coefficient")
+        rate = self.distill_rate
+        require(rate > 0, f"--distill-rate must be above 0, not {rate}")
         return self
 
 

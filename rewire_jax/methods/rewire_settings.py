@@ -6,7 +6,15 @@ from typing import Literal
 
 import jax.numpy as jnp
 
-from rewire_jax.core.settings import require, settings, static, traced
+from rewire_jax.core.settings import (
+    flag,
+    require,
+    require_counts,
+    require_weights,
+    settings,
+    static,
+    traced,
+)
 
 # The authors' distillation sums over both states of each of 256 transitions, and
 # the published alpha belongs to that sum.
@@ -91,14 +99,12 @@ class RewireSettings:
 
     def checked(self) -> "RewireSettings":
         """Returns the settings with `mode_slots`; `UserError` if one is invalid."""
-        require(self.modes >= 1, f"--modes must be at least 1, not {self.modes}")
+        require_counts(self, "modes", "head_slots", "match_every")
         require(
             self.mode_slots == 0 or self.mode_slots >= self.modes,
             f"--mode-slots {self.mode_slots} must be at least --modes {self.modes}",
         )
-        require(self.head_slots >= 1, "--head-slots must be at least 1")
         require(self.width >= 0, f"--width must be at least 0, not {self.width}")
-        require(self.match_every >= 1, "--match-every must be at least 1")
         require(self.cloning_states >= 0, "--cloning-states must be at least 0")
         require(
             self.cloning == 0 or self.cloning_states > 0,
@@ -109,17 +115,15 @@ class RewireSettings:
             "--no-caching: the wirings of earlier tasks are gone; drop "
             "--cloning-states",
         )
-        weights = ("alpha", "beta", "noise", "cloning", "adapter_rate", "score_rate")
-        for name in weights:
-            value = getattr(self, name)
-            flag = name.replace("_", "-")
-            require(0 <= value < jnp.inf, f"--{flag} must be at least 0, not {value}")
+        require_weights(
+            self, "alpha", "beta", "noise", "cloning", "adapter_rate", "score_rate"
+        )
         require(0 <= self.dropout < 1, "--dropout must lie in [0, 1)")
         require(0 < self.anneal <= 1, "--anneal must lie in (0, 1]")
         for name in ("tau", "adapter_tau"):
             value = getattr(self, name)
-            flag = name.replace("_", "-")
-            require(0 < value < jnp.inf, f"--{flag} must be above 0, not {value}")
+            fits = 0 < value < jnp.inf
+            require(fits, f"{flag(name)} must be above 0, not {value}")
         return dataclasses.replace(self, mode_slots=self.mode_slots or self.modes)
 
 

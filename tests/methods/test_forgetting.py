@@ -3,9 +3,9 @@
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -22,6 +22,7 @@ from rewire_jax.run import run_state
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
 from tests.compiles import assert_once, compiles
+from tests.each_method import each
 from tests.tiny import PLAIN
 
 # The goal is not observed. The last is opposite the first.
@@ -33,7 +34,7 @@ SEEDS = 3
 STATES = np.random.default_rng(0).uniform(-1, 1, (64, 2)).astype(np.float32)
 PULLED = ("ft_l2", "ewc")
 KEPT = ("packnet", "pnn", "sac_n", "ft_n", "csp", "cka")
-QUICK = ("ft1", "rewire")
+QUICK = ("ft1", "rewire")  # half a minute each
 # Where the quick profile's values do not fit networks and budgets this small.
 OPTIONS: dict[str, dict] = {
     # At 1 the Fisher information of so few weights, so little trained, holds nothing.
@@ -45,12 +46,6 @@ OPTIONS: dict[str, dict] = {
     "clonex": {"states": 500},
     "reset_distill": {"states": 500, "distill_updates": 2_000, "distill_rate": 1e-3},
 }
-
-
-def each(methods: Iterable[str]) -> list[Any]:
-    """The methods as parameters; half a minute each, so most are slow tests."""
-    marks = {method: () if method in QUICK else pytest.mark.slow for method in methods}
-    return [pytest.param(method, marks=mark) for method, mark in marks.items()]
 
 
 def settings(method: str) -> Settings:
@@ -137,7 +132,7 @@ def lost(scores: np.ndarray) -> np.ndarray:
     return -metrics.forgetting(scores[:, 1:])
 
 
-@pytest.mark.parametrize("method", each(METHODS))
+@pytest.mark.parametrize("method", each(QUICK))
 def test_tasks_are_learned(method: str, trained: Callable[[str], Trained]) -> None:
     before, after = costs(trained(method).scores)
     # What holds on to the first task is in the way of the others.
@@ -145,7 +140,7 @@ def test_tasks_are_learned(method: str, trained: Callable[[str], Trained]) -> No
     assert (after < before / 2)[:, :learned].all(), (before, after)
 
 
-@pytest.mark.parametrize("method", each(METHODS))
+@pytest.mark.parametrize("method", each(QUICK))
 def test_finetuning_forgets_and_the_others_lose_less(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
@@ -180,7 +175,7 @@ def test_cloning_keeps_what_rewire_without_alignment_loses(tmp_path: Path) -> No
     assert losses[1] < 0.1 * losses[0], losses
 
 
-@pytest.mark.parametrize("method", each(KEPT))
+@pytest.mark.parametrize("method", each(QUICK, KEPT))
 def test_what_is_kept_stays_bit_for_bit(
     method: str, trained: Callable[[str], Trained]
 ) -> None:
@@ -196,7 +191,7 @@ def test_what_is_kept_stays_bit_for_bit(
             assert np.abs(latest - actions).max() > 0.5
 
 
-@pytest.mark.parametrize("method", each(METHODS))
+@pytest.mark.parametrize("method", each(QUICK))
 def test_one_trace_for_all_tasks(
     method: str, trained: Callable[[str], Trained]
 ) -> None:

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import typing
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training.acting import act_function
 from rewire_jax.training.run_setup import prepare
+from tests.each_method import each
 from tests.tiny import tiny
 
 SPEC = Spec(observations=3, actions=2, hidden=8, depth=2, tasks=3)
@@ -94,12 +94,6 @@ def test_a_wired_network_is_a_plain_one(network: str) -> None:
     np.testing.assert_allclose(got, method.act(plain, OBSERVATION), atol=1e-5)
     others = [*wiring.fold(params.hidden, orders[:, ::-1]), head]
     assert not np.allclose(got, method.act(others, OBSERVATION), atol=1e-3)
-
-
-def each(quick: Iterable[str]) -> list[Any]:
-    """The methods as parameters; all but the quick ones are slow tests."""
-    marks = {name: () if name in quick else pytest.mark.slow for name in METHODS}
-    return [pytest.param(name, marks=mark) for name, mark in marks.items()]
 
 
 @pytest.mark.parametrize("name", each(("rewire",)))

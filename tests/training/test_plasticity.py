@@ -10,11 +10,12 @@ import rewire_jax
 from rewire_jax.core.settings import SacSettings
 from rewire_jax.core.transition import Batch
 from rewire_jax.envs.scenarios import make_scenario
-from rewire_jax.methods import METHODS, find_method
+from rewire_jax.methods import find_method
 from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training import critic_penalties, plasticity, random_keys, sac
+from tests.each_method import each
 
 SPEC = Spec(observations=3, actions=2, hidden=6, depth=2, tasks=3)
 SETTINGS = SacSettings(
@@ -215,13 +216,7 @@ def test_a_key_for_resets_leaves_the_others_as_they_were():
         equal(jax.random.key_data(one), jax.random.key_data(other))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in REPORTING else pytest.mark.slow)
-        for name in METHODS
-    ],
-)
+@pytest.mark.parametrize("name", each(REPORTING))
 def test_every_method_reports_its_policy_in_training(name):
     network = "layer_norm"
     method = make(name, network)
