@@ -9,6 +9,8 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from rewire_jax.core import kept_programs
+
 OFF = "off"
 # A cache that fails must not stop the program.
 _FAILURES = "Error (reading|writing) persistent compilation cache entry"
@@ -29,6 +31,7 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
       The folder; None if nothing is kept. If this is not what you asked for, a line on
       standard error says why.
     """
+    kept_programs.keep_in(None)
     if folder == OFF:
         jax.config.update("jax_enable_compilation_cache", False)
     told = jax.config.values
@@ -55,6 +58,7 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     warnings.filterwarnings("ignore", _FAILURES)
     # Otherwise JAX would continue to use the folder from before.
     compilation_cache.reset_cache()
+    kept_programs.keep_in(folder / "programs")
     return folder
 
 

@@ -21,6 +21,7 @@ from brax.base import System, Transform
 from brax.envs.base import PipelineEnv
 from brax.envs.base import State as BraxState
 
+from rewire_jax.core import kept_programs
 from rewire_jax.envs import task_parameters
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
 from rewire_jax.envs.geom_trajectory import Film
@@ -67,6 +68,7 @@ def _make_domain(name: str, backend: str) -> Domain:
         env = brax.envs.get_environment(name, backend=backend)
     system = _normalize(env.sys, backend)
     environment = _make_environment(env)
+    kept_programs.give_name(f"{name} {backend}", environment.reset, environment.step)
     bodies = _body_ids(system.mj_model)
     joints = [
         system.mj_model.joint(joint).name

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rewire_jax.core import kept_programs
 from rewire_jax.envs import brax_v1_shim, task_parameters
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
 from rewire_jax.envs.geom_trajectory import Film
@@ -59,8 +60,10 @@ def make_domain(name: str) -> Domain:
       UserError: the installed brax has no `brax.v1`.
     """
     systems = Systems(name)
+    environment = _make_environment(systems)
+    kept_programs.give_name(f"{name} v1", environment.reset, environment.step)
     return task_parameters.physical_domain(
-        _make_environment(systems),
+        environment,
         _joint_of_each_action(systems.config),
         list(systems.bodies),
         systems.physics,

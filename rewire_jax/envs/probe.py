@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core import kept_programs
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs import task_parameters
 from rewire_jax.envs.base import Domain, Environment, State, Task, TaskChange
@@ -106,6 +107,7 @@ def _make_domain(name: str) -> Domain:
         action_size=len(probe.joints),
         episode_length=probe.episode_length,
     )
+    kept_programs.give_name(name, reset, step)
     return Domain(environment, make_task)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from rewire_jax.core import kept_programs
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import (
     cka,
@@ -75,6 +76,10 @@ METHODS: dict[str, Entry] = {
         reset_distill.preset,
     ),
 }
+
+
+for _name, _entry in METHODS.items():
+    kept_programs.give_name(_name, _entry.make)
 
 
 def register_method(name: str, entry: Entry) -> None:

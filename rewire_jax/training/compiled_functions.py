@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from jax.sharding import Mesh
 
+from rewire_jax.core import kept_programs
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Candidates, CandidateScore, Method
@@ -69,10 +70,12 @@ def rollout_function(
     count: int,
     mesh: Mesh,
     score: CandidateScore,
+    name: str,
 ) -> Callable[..., rollout.Rollout]:
     """`(tasks, policies, keys) -> Rollout` for fixed sizes, see `rollout.episodes`.
 
-    Methods whose policies are computed alike share one compiled function.
+    Methods whose policies are computed alike share one compiled function, unless its
+    program is kept: that has a name.
     """
     play = rollout.PLAYS[score]
 
@@ -80,7 +83,9 @@ def rollout_function(
         assert keys.shape[1] == rows
         return play(environment, act, tasks, policies, keys, count)
 
-    return population.compiled(episodes, (None, 0, 0), mesh)
+    if name:
+        name = f"{name} rollout {rows} {count} {score}"
+    return population.compiled(episodes, (None, 0, 0), mesh, name=name)
 
 
 @functools.lru_cache
@@ -94,8 +99,9 @@ def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
     """
     method = of.make(of.spec, example)
     traces = population.Traces()
-    loop, trial = _loop(of, method, mesh, traces)
-    over = functools.partial(population.over, mesh)
+    name = _name(of, example)
+    loop, trial = _loop(of, method, mesh, traces, name)
+    over = functools.partial(_over, mesh, name)
     return Program(
         init=over(of.init, 0),
         after_baseline=over(of.after_baseline, 0, 0, 0, donate=(1,))
@@ -105,7 +111,15 @@ def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
         if method.consolidate
         else None,
         offline_update=over(
-            traces.of(of.offline_update), 0, 0, None, None, None, None, donate=(1,)
+            of.offline_update,
+            0,
+            0,
+            None,
+            None,
+            None,
+            None,
+            donate=(1,),
+            traces=traces,
         ),
         candidates=over(of.candidates, 0, 0, None) if method.candidates else None,
         finish=over(of.finish, 0, 0, None, 0),
@@ -118,8 +132,34 @@ def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
     )
 
 
+def _name(of: MemberFunctions, example: Any) -> str:
+    """What the functions of a run compute, see `kept_programs`; empty if unknown."""
+    environment = of.environment
+    if isinstance(environment, HostEnvironment) or not kept_programs.programs_kept():
+        return ""
+    domain = kept_programs.common_name(environment.reset, environment.step)
+    method = kept_programs.common_name(of.make)
+    if not domain or not method:
+        return ""
+    numbers = [each for each in environment if isinstance(each, int)]
+    statics = jax.tree.structure(example)
+    return f"{domain} {numbers} {method} {of.spec} {of.shape} {statics}"
+
+
+def _over(
+    mesh: Mesh, name: str, function: Callable[..., Any], *axes: int | None, **how: Any
+) -> Callable[..., Any]:
+    """`population.over`, with the name of a run's function."""
+    name = name and f"{name} {function.__name__}"
+    return population.over(mesh, function, *axes, name=name, **how)
+
+
 def _loop(
-    of: MemberFunctions, method: Method, mesh: Mesh, traces: population.Traces
+    of: MemberFunctions,
+    method: Method,
+    mesh: Mesh,
+    traces: population.Traces,
+    name: str,
 ) -> tuple[host_train_loop.Loop, Callable[..., rollout.Rollout]]:
     """The functions that step environments, and `Program.trial`."""
     environment = of.environment
@@ -137,14 +177,14 @@ def _loop(
     def play(score: CandidateScore) -> Callable[..., rollout.Rollout]:
         def episodes(tasks, policies, keys, count):
             sizes = keys.shape[1], count, mesh, score
-            function = rollout_function(environment, act, *sizes)
+            function = rollout_function(environment, act, *sizes, name)
             return function(tasks, policies, keys)
 
         return episodes
 
-    over = functools.partial(population.over, mesh)
+    over = functools.partial(_over, mesh, name)
     begins = over(of.begin, 0, 0, 0, None, None)
-    trains = over(traces.of(of.chunk), 0, 0, None, None, None, None, donate=(1,))
+    trains = over(of.chunk, 0, 0, None, None, None, None, donate=(1,), traces=traces)
     loop = host_train_loop.Loop(
         begin=begins,
         chunk=trains,

@@ -198,7 +198,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         act=jax.jit(traces.of(act)),
         # With overlap, the previous learner acts meanwhile, so it is not donated.
         store_and_update=over(
-            traces.of(store_and_update),
+            store_and_update,
             0,
             0,
             0,
@@ -207,6 +207,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
             None,
             0,
             donate=(2,) if shape.overlap else (1, 2),
+            traces=traces,
         ),
         inspect=over(inspect, 0, 0, 0, None, None),
     )

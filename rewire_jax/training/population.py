@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from rewire_jax.core import kept_programs
 from rewire_jax.core.settings import SacSettings, Settings
 
 _AXIS = "members"
@@ -117,6 +118,8 @@ def compiled(
     axes: Sequence[int | None],
     mesh: Mesh,
     donate: tuple[int, ...] = (),
+    name: str = "",
+    traces: Traces | None = None,
 ) -> Callable[..., Any]:
     """A function of whole populations, compiled at its first call.
 
@@ -127,6 +130,8 @@ def compiled(
       axes: for each argument 0, or None if all members share it.
       mesh: the devices.
       donate: arguments whose memory the result may reuse.
+      name: what it computes, if its program may be kept for later processes.
+      traces: counts how often it is traced.
     """
     shares = tuple(P() if axis is None else P(_AXIS) for axis in axes)
     # Members vary over devices and counters do not, and loops carry both.
@@ -136,7 +141,15 @@ def compiled(
     # Needed for one device, too. Without it, a function's results and the arrays from
     # `place` have different shardings, and a function is traced once for each.
     by_member = NamedSharding(mesh, P(_AXIS))
-    return jax.jit(local, donate_argnums=donate, out_shardings=by_member)
+
+    def jitted(function: Callable[..., Any]) -> Callable[..., Any]:
+        counted = traces.of(function) if traces else function
+        return jax.jit(counted, donate_argnums=donate, out_shardings=by_member)
+
+    # A kept program is one for a single device.
+    if name and mesh.size == 1:
+        return kept_programs.kept(local, name, jitted)
+    return jitted(local)
 
 
 def over(
@@ -144,6 +157,8 @@ def over(
     function: Callable[..., Any],
     *axes: int | None,
     donate: tuple[int, ...] = (),
+    name: str = "",
+    traces: Traces | None = None,
 ) -> Callable[..., Any]:
     """Turns a function of one member into one of populations, see `compiled`."""
-    return compiled(jax.vmap(function, axes), axes, mesh, donate)
+    return compiled(jax.vmap(function, axes), axes, mesh, donate, name, traces)
