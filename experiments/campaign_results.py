@@ -2,18 +2,24 @@
 
 Each scenario of the campaign gets a folder in experiments/results: tables and pictures
 as `rewire-jax report` has them, the probabilities of improvement, and the campaign's
-two tidy tables.
+two tidy tables. The files of the finished runs are kept there, too, but not their
+checkpoints. With --restore, another machine goes on from them.
 """
 
 import dataclasses
+import tarfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import rewire_jax
 from experiments import suite
 from rewire_jax.core.settings import require
+from rewire_jax.reports.campaign_data import read_campaign_data
 from rewire_jax.reports.campaign_section import IMPROVEMENT, Section
 from rewire_jax.reports.table import to_markdown
+from rewire_jax.run.campaign_jobs import Job
+from rewire_jax.storage.run_folder import HEADER, TABLES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,10 +29,12 @@ class Kept:
     Attributes:
       file: TOML file of the campaign.
       runs: folder of the campaign; by default runs/ and the name of the file.
+      restore: first put kept runs into that folder, where it does not have them.
     """
 
     file: Path
     runs: Path | None = None
+    restore: bool = False
 
 
 def improvement(section: Section) -> list[str]:
@@ -45,13 +53,50 @@ def improvement(section: Section) -> list[str]:
     ]
 
 
+def archive(job: Job, folder: Path) -> Path:
+    """Where the files of a run are kept, in the folder of its campaign's results."""
+    return folder / "runs" / f"{job.run.name}.tar.xz"
+
+
+def keep_runs(jobs: Sequence[Job], folder: Path) -> None:
+    """Keeps the files of runs that are not kept yet."""
+
+    def anonymous(info: tarfile.TarInfo) -> tarfile.TarInfo:
+        info.mtime = info.uid = info.gid = 0
+        info.uname = info.gname = ""
+        return info
+
+    for job in jobs:
+        path = archive(job, folder)
+        if path.exists():
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tarfile.open(path, "x:xz") as file:
+            for name in (HEADER, *TABLES):
+                file.add(job.folder / name, name, filter=anonymous)
+
+
+def restore_runs(jobs: Sequence[Job], folder: Path) -> None:
+    """Puts kept runs where the campaign does not have them."""
+    for job in jobs:
+        path = archive(job, folder)
+        if path.exists() and not job.started:
+            job.folder.mkdir(parents=True)
+            with tarfile.open(path) as file:
+                file.extractall(job.folder, filter="data")
+
+
 def run(job: Kept) -> None:
     """Writes the folders.
 
     Raises:
       UserError: the campaign cannot be read, or no run is finished.
     """
+    results = suite.RESULTS / f"campaign-{job.file.stem}"
+    if job.restore:
+        restore_runs(read_campaign_data(job.file, job.runs).jobs, results)
     report = rewire_jax.write_campaign_report(job.file, job.runs)
+    data = report.data
     require(bool(report.sections), f"no run of {job.file} is finished")
     tidy = {path.name: path.read_text() for path in (report.returns, report.runs)}
     for number, section in enumerate(report.sections):
@@ -65,6 +110,7 @@ def run(job: Kept) -> None:
         )
         kept.write()
         print(kept.page)
+    keep_runs([each for each in data.jobs if each.run.name in data.finished], results)
 
 
 if __name__ == "__main__":

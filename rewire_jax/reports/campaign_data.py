@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import require
 from rewire_jax.reports.data_files import csv_text
 from rewire_jax.run.campaign_file import Campaign, read_campaign
 from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of
@@ -99,7 +100,9 @@ def read_campaign_data(file: str | Path, out: str | Path | None = None) -> Campa
         try:
             evaluated[name] = read_rows(job.folder)
             if name in known.done:
-                finished[name] = read_run(job.folder)
+                run = read_run(job.folder)
+                require(run.complete, f"{job.folder}/results.jsonl lacks rows")
+                finished[name] = run
         except UserError as error:
             evaluated.pop(name, None)
             unreadable[name] = str(error)

@@ -19,11 +19,12 @@ from typing import Any
 
 import jax
 
-from rewire_jax.core.errors import writing
+from rewire_jax.core.errors import UserError, writing
 from rewire_jax.run import run_state
 from rewire_jax.run.campaign_file import Campaign, Run
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading, text
+from rewire_jax.storage.run_results import read_run
 
 _TRIES = 2  # after so many failures a run is set aside
 Process = subprocess.Popen[bytes]
@@ -58,8 +59,13 @@ class Job:
 
     @property
     def done(self) -> bool:
-        """Whether the run is finished."""
-        return run_state.finished(self.folder, self.run.settings.tasks - 1)
+        """Whether the run is finished; then its checkpoints may be deleted."""
+        if (self.folder / "checkpoints").exists():
+            return run_state.finished(self.folder, self.run.settings.tasks - 1)
+        try:
+            return self.started and read_run(self.folder).complete
+        except UserError:
+            return False
 
     @property
     def failures(self) -> int:

@@ -6,6 +6,7 @@ from experiments import campaign_results, readme, suite
 from experiments.campaign_results import Kept
 from rewire_jax.core.errors import UserError
 from rewire_jax.run.campaign_file import read_campaign
+from rewire_jax.run.campaign_jobs import Job
 from tests.reports.test_campaign_report import write_file, write_runs
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,6 +32,35 @@ def test_results_are_kept_so_that_a_page_can_show_them(tmp_path, monkeypatch):
     # Rewire's scores are higher in every pair of seeds.
     row = next(x for x in text.splitlines() if x.startswith("| Ours") and "1.00" in x)
     assert "–" in row
+
+
+def test_another_machine_goes_on_from_kept_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "RESULTS", tmp_path / "results")
+    file = write_file(tmp_path / "made", "ft1", "rewire")
+    jobs = write_runs(file)
+    (jobs[0].folder / "checkpoints/task-002").rmdir()  # not finished
+    campaign_results.run(Kept(file=file, runs=file.parent))
+    kept = {path: path.read_bytes() for path in tmp_path.glob("results/**/*.tar.xz")}
+    assert len(kept) == len(jobs) - 1
+    new = tmp_path / "new"
+    campaign_results.run(Kept(file=file, runs=new, restore=True))
+    assert [Job(new, job.run).done for job in jobs] == [False] + [True] * 5
+    for name in ("settings.json", "results.jsonl", "training.jsonl", "timing.jsonl"):
+        there = new / jobs[1].run.name / name
+        assert there.read_bytes() == (jobs[1].folder / name).read_bytes()
+    assert {path: path.read_bytes() for path in kept} == kept
+
+
+def test_restoring_leaves_a_run_that_is_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(suite, "RESULTS", tmp_path / "results")
+    file = write_file(tmp_path / "made", "ft1")
+    jobs = write_runs(file)
+    campaign_results.run(Kept(file=file, runs=file.parent))
+    table = jobs[0].folder / "results.jsonl"
+    shorter = b"".join(table.read_bytes().splitlines(keepends=True)[:2])
+    table.write_bytes(shorter)
+    campaign_results.run(Kept(file=file, runs=file.parent, restore=True))
+    assert table.read_bytes() == shorter
 
 
 def test_nothing_is_kept_of_a_campaign_without_results(tmp_path, monkeypatch):
