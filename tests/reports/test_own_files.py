@@ -71,6 +71,15 @@ def link_away(folder: Path) -> None:
     (folder / "a.csv").symlink_to(folder / "nowhere")
 
 
+def files(folder: Path) -> dict[str, tuple[int, ...]]:
+    """What changes where a file is written or replaced."""
+    found = {path.name: path.lstat() for path in folder.iterdir()}
+    return {
+        name: (stat.st_mode, stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        for name, stat in found.items()
+    }
+
+
 CHANGES = (write_note, edit_page, append_to_page, draw_another, delete_page, link_away)
 
 
@@ -80,10 +89,10 @@ def test_what_no_report_wrote_stays(
 ) -> None:
     report(tmp_path, 1).write()
     change(tmp_path)
-    before = {p.name: p.lstat() for p in tmp_path.iterdir()}
+    before = files(tmp_path)
     with pytest.raises(UserError, match=str(tmp_path)):
         report(tmp_path, 2).write()
-    assert {p.name: p.lstat() for p in tmp_path.iterdir()} == before
+    assert files(tmp_path) == before
 
 
 def test_the_same_files_of_an_interrupted_report_are_no_hindrance(
