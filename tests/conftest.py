@@ -22,6 +22,10 @@ if version("jaxlib").startswith("0.10."):
 os.environ.setdefault("XLA_FLAGS", _FLAGS)
 
 
+# Tracing makes many objects and few cycles; looking for them takes a tenth of the time.
+gc.set_threshold(100_000, 50, 50)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
     """Frees a file's compiled programs after it.

@@ -126,7 +126,7 @@ def test_a_heavy_torso_is_slower_to_move():
 @pytest.mark.parametrize(
     ("domain", "factor", "slope"),
     [
-        ("halfcheetah", 0.4, 0.3),
+        pytest.param("halfcheetah", 0.4, 0.3, marks=pytest.mark.slow),
         pytest.param("ant", 0.375, 0.7, marks=pytest.mark.slow),
     ],
 )

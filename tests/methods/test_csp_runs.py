@@ -25,6 +25,7 @@ from tests.csp_parts import (
 from tests.tiny import tiny
 
 
+@pytest.mark.slow
 def test_a_member_is_the_same_alone_and_in_a_crowd():
     def life(options, key):
         method = csp.csp(SPEC, options)

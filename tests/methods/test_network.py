@@ -96,7 +96,7 @@ def test_a_wired_network_is_a_plain_one(network: str) -> None:
     assert not np.allclose(got, method.act(others, OBSERVATION), atol=1e-3)
 
 
-@pytest.mark.parametrize("name", each(("rewire",)))
+@pytest.mark.parametrize("name", each(("ft1",)))
 def test_a_run_trains_the_network(name: str, tmp_path: Path) -> None:
     settings = tiny(method=name)
     # Of CSP's candidates every step counts.

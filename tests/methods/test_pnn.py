@@ -255,6 +255,7 @@ def test_eight_columns_have_the_published_size(observations, actions, base, publ
     assert round(numbers / base, 1) == published
 
 
+@pytest.mark.slow
 def test_members_are_the_same_alone():
     def member(key):
         first, state = PLAIN.init(key)

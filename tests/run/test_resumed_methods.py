@@ -24,11 +24,14 @@ PLASTIC = {
 @pytest.mark.parametrize(
     ("method", "times", "name", "resumed", "sac"),
     [
-        ("packnet", 3, "offline_update", "task-001-step-0000040", {}),
+        pytest.param(
+            *("packnet", 3, "offline_update", "task-001-step-0000040", {}),
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             *("csp", 5, "chunk", "task-001-step-0000020", {}), marks=pytest.mark.slow
         ),
-        pytest.param(*("ft1", 5, "chunk", "task-001", PLASTIC), marks=pytest.mark.slow),
+        ("ft1", 5, "chunk", "task-001", PLASTIC),
     ],
 )
 def test_what_a_method_needs_within_a_task_is_saved(

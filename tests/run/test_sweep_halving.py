@@ -41,6 +41,7 @@ def test_halving_keeps_the_best_configurations(tmp_path: Path) -> None:
     near(halved, {place: whole[place] for place in halved})
 
 
+@pytest.mark.slow
 def test_random_and_halved_from_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

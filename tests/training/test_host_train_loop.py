@@ -77,6 +77,7 @@ def test_lanes_in_processes_do_what_one_process_does(monkeypatch):
     open_lanes.cache_clear()
 
 
+@pytest.mark.slow
 def test_a_member_does_what_it_would_do_alone():
     environment = walk.walker(0.5)
     crowd = planned(environment, seeds=2)

@@ -36,7 +36,8 @@ def small(method: str = "rewire") -> rewire_jax.Settings:
 @pytest.mark.parametrize(
     "method",
     [
-        "rewire",
+        "ft1",
+        pytest.param("rewire", marks=pytest.mark.slow),
         pytest.param("packnet", marks=pytest.mark.slow),
         pytest.param("csp", marks=pytest.mark.slow),
         pytest.param("pnn", marks=pytest.mark.slow),

@@ -78,6 +78,7 @@ def compiled(monkeypatch):
     return build
 
 
+@pytest.mark.slow
 def test_groups_are_compiled_without_branches(compiled):
     members = crowd()
     members = members._replace(sac=dataclasses.replace(members.sac, **DELAYS))
