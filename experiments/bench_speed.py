@@ -22,6 +22,7 @@ from experiments.speed import (
     permutation,
     sizes,
     startup,
+    update_kernels,
     updates,
 )
 from experiments.speed.part import Effort, Part
@@ -33,6 +34,7 @@ from rewire_jax.storage import run_folder
 
 PARTS: dict[str, Part] = {
     "updates": updates.PART,
+    "kernels": update_kernels.PART,
     "sizes": sizes.PART,
     "permutation": permutation.PART,
     "environments": environments.PART,

@@ -34,8 +34,14 @@ def draw_batches(spec: Spec, size: int) -> Batch:
     return Batch(first, action, reward, ended, ended, second)
 
 
-def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
+def updates(
+    settings: Settings, group: int | None = None
+) -> tuple[Any, Callable[..., Any], Batch]:
     """A population of one in its second task, and its updates as training makes them.
+
+    Args:
+      settings: of the run.
+      group: updates in a group, 1 for a branch in each; by default as in training.
 
     Returns:
       The population's state, a function `(state, batches, count) -> state` to be
@@ -72,10 +78,10 @@ def updates(settings: Settings) -> tuple[Any, Callable[..., Any], Batch]:
             draws = jax.vmap(draw)(jax.random.split(key, drawn))
             made = jnp.minimum(drawn, count - first)
             # At most 2, and `repetitions` gives even counts.
-            group = sac_updates.group_size(drawn, member.sac)
+            together = group or sac_updates.group_size(drawn, member.sac)
             numbers = draws, batch, first, made
             learner, metrics = sac_updates.updates(
-                learner, *numbers, method, member.sac, group
+                learner, *numbers, method, member.sac, together
             )
             latest = Round(first, first + drawn, metrics)
             return learner.with_learned(

@@ -42,6 +42,17 @@ def test_updates_are_measured_against_products(tmp_path, capsys):
     assert all(name in printed for name in rows)
 
 
+@pytest.mark.slow
+def test_groups_have_no_branch_and_fewer_kernels(tmp_path):
+    rows = quick(tmp_path, "kernels")["kernels"]
+    counts = {(row["policy"], row["form"]): row for row in rows}
+    for policy in ("plain", "rewire"):
+        branches, groups = counts[policy, "a branch in each"], counts[policy, "groups"]
+        assert branches["conditional"] == 2
+        assert groups["conditional"] == 0
+        assert 0 < groups["kernels"] < branches["kernels"]
+
+
 def test_a_part_is_measured_anew_and_the_others_are_kept(tmp_path):
     kept = {"rows": [{"loop": "kept", "best": 2.0}], "seconds": 1.0, "load": [0.0, 0.0]}
     kept |= {"rounds": 1, "provenance": run_folder.provenance()}
