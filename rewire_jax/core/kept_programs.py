@@ -82,6 +82,8 @@ def kept(
             programs[key] = compiled(made) if made else plain
         return programs[key](*arguments)
 
+    # As of any compiled function.
+    call.lower = plain.lower  # type: ignore[attr-defined]
     return call
 
 

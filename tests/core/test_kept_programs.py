@@ -138,6 +138,11 @@ def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path):
     np.testing.assert_allclose(result(Process()).left, expected(), rtol=1e-6)
 
 
+def test_it_can_be_lowered():
+    text = Process().call.lower(Pair(POINTS, {}), jax.random.key(0)).as_text()
+    assert "tensor<2x3xf32>" in text
+
+
 def test_shapes_alone_need_no_trace():
     result(Process())
     process = Process()
