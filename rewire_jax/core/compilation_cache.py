@@ -12,6 +12,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from rewire_jax.core import kept_programs
 
 OFF = "off"
+VARIABLE = "REWIRE_JAX_CACHE"  # in the environment, the default of `folder`
 # A cache that fails must not stop the program.
 _FAILURES = "Error (reading|writing) persistent compilation cache entry"
 
@@ -20,21 +21,27 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
     """Keeps compiled programs on disk, so that later processes can load them.
 
     Processes may share the folder. You can delete it at any time. JAX executes what is
-    in it, so nobody else should be able to write to it.
+    in it, so nobody else should be able to write to it. Traced programs are kept, too,
+    see `kept_programs`, but not in a folder of JAX's own setting.
 
     Args:
-      folder: where to keep them; "off" keeps nothing. If None, JAX's own setting (such
-        as JAX_COMPILATION_CACHE_DIR) applies. If JAX has none, the folder is
-        `rewire_jax` under XDG_CACHE_HOME or ~/.cache.
+      folder: where to keep them; "off" keeps nothing. If None, REWIRE_JAX_CACHE in the
+        environment says it; if this is not set, JAX's own setting (such as
+        JAX_COMPILATION_CACHE_DIR). If JAX has none, the folder is `rewire_jax` under
+        XDG_CACHE_HOME or ~/.cache.
 
     Returns:
       The folder; None if nothing is kept. If this is not what you asked for, a line on
       standard error says why.
     """
-    kept_programs.keep_in(None)
-    if folder == OFF:
-        jax.config.update("jax_enable_compilation_cache", False)
     told = jax.config.values
+    if not folder and kept_programs.programs_kept():
+        return Path(told["jax_compilation_cache_dir"])  # of an earlier call
+    kept_programs.keep_in(None)
+    folder = folder or os.environ.get(VARIABLE)
+    if folder:
+        jax.config.update("jax_enable_compilation_cache", folder != OFF)
+        told = jax.config.values
     if not told["jax_enable_compilation_cache"]:
         return None
     theirs = None if folder else told["jax_compilation_cache_dir"]
@@ -65,3 +72,13 @@ def keep_compiled(folder: str | Path | None = None) -> Path | None:
 def _default() -> Path:
     caches = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(caches) / "rewire_jax"
+
+
+def environment() -> dict[str, str]:
+    """Environment variables that give another process this one's folder."""
+    told = jax.config.values
+    if not told["jax_enable_compilation_cache"]:
+        return {VARIABLE: OFF}
+    if kept_programs.programs_kept():
+        return {VARIABLE: told["jax_compilation_cache_dir"]}
+    return {}  # JAX's own setting, or no folder at all

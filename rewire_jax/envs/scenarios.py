@@ -15,7 +15,8 @@ class ScenarioSpec:
 
     Attributes:
       name: its name, by convention `"domain/kind"`.
-      domain: `"halfcheetah"`, `"ant"`, `"humanoid"`, `"metaworld"` or a probe's name.
+      domain: `"halfcheetah"`, `"ant"`, `"humanoid"`, `"metaworld"`, a probe's name, or
+        one given to `register_domain`.
       changes: the tasks in order; equal changes are the same task, which recurs.
       repeats: how often the whole list is repeated.
       interactions: environment steps of training for each task.

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 
 from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.core.settings import require
-from rewire_jax.methods import rewire_alignment as alignment
-from rewire_jax.methods import wiring
+from rewire_jax.methods import rewire_alignment, wiring
 from rewire_jax.methods.base import Candidates, Method, Policy, Purpose, Selection
 from rewire_jax.methods.rewire_cloning import with_cloning
 from rewire_jax.methods.rewire_losses import Gaussian, distillation_loss, gaussian_kl
@@ -175,7 +174,7 @@ def penalty(
     l_kl = distillation_loss(other, gaussian, options.distillation)
     l_kl = jnp.where(design.modes > 1, l_kl, 0.0)
     loss = options.alpha * DISTILLED_STATES * l_kl
-    l_sp = alignment.penalty(design, params, state)
+    l_sp = rewire_alignment.alignment_term(design, params, state)
     return loss + options.beta * l_sp, {"distillation": l_kl}
 
 
@@ -198,7 +197,7 @@ def after_round(
     """Solves for the adapters when it is time, and sets the intensity."""
     options = design.options
     if options.alignment == "matching":
-        params = alignment.match_in_time(design, params, state, made)
+        params = rewire_alignment.match_in_time(design, params, state, made)
     if options.intensity == "linear":
         share = made.after / design.spec.updates
         state = state._replace(intensity=jnp.maximum(1 - share / options.anneal, 0.0))
@@ -251,7 +250,7 @@ def inspect(
     return {
         "mode_divergence": total / jnp.maximum(modes * (modes - 1), 1),
         # Updates need only its gradient, which is cheaper than its value.
-        "alignment": alignment.penalty(design, params, state),
+        "alignment": rewire_alignment.alignment_term(design, params, state),
     }
 
 
@@ -276,7 +275,7 @@ def select_order(
     valid = design.valid()
     after = jnp.where(valid, selection.ranked, -jnp.inf)
     before = jnp.sum(jnp.where(valid, selection.before, 0.0)) / design.modes
-    chosen = choosing(design, state) * jnp.argmax(after)
+    chosen = jnp.where(choosing(design, state), jnp.argmax(after), 0)
     order = jnp.argsort(params.scores[chosen], axis=-1)
     return order, (state.learned > 0) & (jnp.max(after) < before)
 
@@ -304,7 +303,7 @@ def end_task(
     params = jax.tree.map(lambda a, b: jnp.where(failed, a, b), began, params)
     latest = state.orders[design.known_slot(state, task) % design.cached]
     order = jnp.where(failed, latest, order)
-    refined = alignment.refined_orders(design, params, state)
+    refined = rewire_alignment.refined_orders(design, params, state)
     order = order.astype(refined.dtype)
     return Params(
         hidden=params.hidden,

@@ -13,7 +13,7 @@ from rewire_jax.methods.rewire_state import Design, Params, State
 from rewire_jax.methods.round import Round
 
 
-def penalty(design: Design, params: Params, state: State) -> jax.Array:
+def alignment_term(design: Design, params: Params, state: State) -> jax.Array:
     """L_SP or, with alignment "off", L_reg; 0 in the first task."""
     options = design.options
     if options.alignment == "off":

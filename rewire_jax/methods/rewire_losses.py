@@ -1,7 +1,6 @@
 """The losses of the rewiring method: L_KL (Eq. 6), L_reg (Eq. 7) and L_SP (Eq. 11).
 
-The policy's loss is SAC's plus alpha L_KL plus beta L_SP; `penalty` in `rewire.py`
-adds them up.
+`penalty` in `rewire.py` adds L_KL and L_SP, with their weights, to SAC's policy loss.
 """
 
 from collections.abc import Iterable, Sequence

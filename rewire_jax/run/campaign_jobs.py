@@ -15,10 +15,8 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import jax
-
+from rewire_jax.core import compilation_cache
 from rewire_jax.core.errors import UserError, writing
 from rewire_jax.run import run_state
 from rewire_jax.run.campaign_file import Campaign, Run
@@ -180,21 +178,12 @@ def start(words: Sequence[str], log: Path, cores: Collection[int] = ()) -> Proce
             stdin=subprocess.PIPE,
             stdout=out,
             stderr=subprocess.STDOUT,
-            env=os.environ | _cache(),
+            env=os.environ | compilation_cache.environment(),
             start_new_session=True,  # Only this process reacts to Ctrl-C.
         )
     if cores and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(process.pid, cores)
     return process
-
-
-def _cache() -> dict[str, str]:
-    """Environment variables that give a process this one's compilation cache."""
-    told: dict[str, Any] = jax.config.values
-    if not told["jax_enable_compilation_cache"]:
-        return {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    folder = told["jax_compilation_cache_dir"]
-    return {"JAX_COMPILATION_CACHE_DIR": folder} if folder else {}
 
 
 def last_line(path: Path) -> str:

@@ -34,7 +34,7 @@ class RunState(NamedTuple):
 
     Attributes:
       stage: the task being trained, or to be trained next.
-      steps: vector steps made in it.
+      steps: vector steps made in it, and then rounds of offline updates.
       learner: between tasks, the learner.
       state: within a task, the learner and all else.
       before: within a task, the candidates' returns at its start, or None.

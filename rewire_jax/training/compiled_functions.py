@@ -141,9 +141,10 @@ def _name(of: MemberFunctions, example: Any) -> str:
     method = kept_programs.common_name(of.make)
     if not domain or not method:
         return ""
-    numbers = [each for each in environment if isinstance(each, int)]
+    functions = "reset", "step", "film"
+    rest = [v for k, v in environment._asdict().items() if k not in functions]
     statics = jax.tree.structure(example)
-    return f"{domain} {numbers} {method} {of.spec} {of.shape} {statics}"
+    return f"{domain} {rest} {method} {of.spec} {of.shape} {statics}"
 
 
 def _over(

@@ -99,7 +99,7 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
     """Returns training as a pure function of a random key.
 
     The function writes no files and prints nothing. The key `jax.random.key(seed)`
-    gives the results of a run with this seed.
+    gives the results of a run with this seed, up to rounding.
 
     Args:
       settings: settings of the run, for instance from `preset`. Its `seed`, `seeds`

@@ -114,6 +114,54 @@ def test_other_folder_or_none(tmp_path):
     assert not default.exists()
 
 
+def test_the_environment_says_it(tmp_path):
+    default, ours, told = (tmp_path / name for name in ("default", "ours", "told"))
+    jax_told = {"JAX_COMPILATION_CACHE_DIR": str(told)}
+    processes = [
+        start(default, REWIRE_JAX_CACHE=str(ours), **jax_told),
+        start(default, REWIRE_JAX_CACHE="off"),
+    ]
+    made = [finish(process)[2] for process in processes]
+    assert made == [len(list(ours.iterdir())), 0]
+    assert made[0] > 0
+    assert not default.exists()
+    assert not told.exists()
+
+
+FOLDERS = """
+import sys
+import jax
+from rewire_jax.core import compilation_cache as it, kept_programs
+for folder in sys.argv[1:]:
+    print(it.keep_compiled(folder if folder != "none" else None))
+    print(kept_programs.programs_kept(), it.environment())
+"""
+
+
+def test_another_process_gets_the_same_folder(tmp_path):
+    words = "none", tmp_path / "own", "none", "off", "none", tmp_path / "own"
+    env = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    env["XDG_CACHE_HOME"] = str(tmp_path)
+    told = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "told")}
+    outs = [
+        subprocess.run(
+            [sys.executable, "-c", FOLDERS, *map(str, words)],
+            env=env | more,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.splitlines()
+        for more in ({}, told)
+    ]
+    default, own = tmp_path / "rewire_jax", tmp_path / "own"
+    kept = [str(own), f"True {{'REWIRE_JAX_CACHE': '{own}'}}"]
+    off = ["None", "False {'REWIRE_JAX_CACHE': 'off'}"]
+    first = [str(default), f"True {{'REWIRE_JAX_CACHE': '{default}'}}"]
+    assert outs[0] == first + kept + kept + off + off + kept
+    theirs = [str(tmp_path / "told"), "False {}"]
+    assert outs[1] == theirs + kept + kept + off + off + kept
+
+
 def test_command_reads_its_flag(monkeypatch, capsys):
     given = []
     monkeypatch.setattr(main, "keep_compiled", given.append)
