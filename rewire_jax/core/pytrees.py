@@ -24,3 +24,13 @@ def at(tree: Any, index: jax.Array) -> Any:
 def put(tree: Any, index: jax.Array, value: Any) -> Any:
     """Returns a stacked pytree with the entries at an index replaced."""
     return jax.tree.map(lambda x, v: x.at[index].set(v), tree, value)
+
+
+def learned_place(place: jax.Array, learned: jax.Array) -> jax.Array:
+    """Returns `[]`: a task's place or, if it is not learned yet, the latest one's.
+
+    Args:
+      place: `[]` int, the task's place.
+      learned: `[]` int, how many places are learned; before the first, place 0 counts.
+    """
+    return jnp.minimum(place, jnp.maximum(learned - 1, 0))

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from rewire_jax.core.pytrees import count
+from rewire_jax.core.pytrees import count, learned_place
 from rewire_jax.core.settings import require_counts, settings
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
@@ -152,8 +152,8 @@ def cka(spec: Spec, options: CkaSettings) -> Method:
         )
 
     def policy(params, state, task):
-        latest = jnp.minimum(task, jnp.maximum(state.learned - 1, 0))
-        kept = state.base + state.weights[latest] @ state.pool
+        weights = state.weights[learned_place(task, state.learned)]
+        kept = state.base + weights @ state.pool
         return layers(jnp.where(state.learned > 0, kept, params.vector))
 
     return Method(

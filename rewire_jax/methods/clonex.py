@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from rewire_jax.core.pytrees import at, count
+from rewire_jax.core.pytrees import at, count, learned_place
 from rewire_jax.core.settings import (
     require,
     require_counts,
@@ -187,8 +187,7 @@ def clonex(spec: Spec, options: ClonexSettings) -> Method:
         return params, state._replace(learned=state.learned + 1)
 
     def policy(params, state, task):
-        latest = jnp.maximum(state.learned - 1, 0)
-        return layers(params, jnp.minimum(task % slots, latest))
+        return layers(params, learned_place(task % slots, state.learned))
 
     return Method(
         init=init,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.core.pytrees import count, put, tile
+from rewire_jax.core.pytrees import count, learned_place, put, tile
 from rewire_jax.methods.base import (
     Candidates,
     Method,
@@ -270,8 +270,7 @@ def end_task(
 
 def policy(params: Params, state: State, task: jax.Array) -> Policy:
     """The plain MLP of a task's best weights; a new task gets the latest's."""
-    latest = jnp.maximum(state.learned - 1, 0)
-    folded = fold(state.anchors, state.best[jnp.minimum(task, latest)])
+    folded = fold(state.anchors, state.best[learned_place(task, state.learned)])
     return jax.tree.map(lambda a, b: jnp.where(state.learned > 0, a, b), folded, params)
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from rewire_jax.core.pytrees import at, count, put, tile
+from rewire_jax.core.pytrees import at, count, learned_place, put, tile
 from rewire_jax.core.settings import require_counts, settings
 from rewire_jax.methods.base import Act, Method
 from rewire_jax.methods.shared import Shared
@@ -149,8 +149,8 @@ def pnn(spec: Spec, options: PnnSettings) -> Method:
 
     def policy(params, state, task):
         del params
-        latest = jnp.maximum(state.learned - 1, 0)
-        return Policy(Shared(state.columns), jnp.minimum(task, latest))
+        place = learned_place(task, state.learned)
+        return Policy(Shared(state.columns), place)
 
     def size(params, state):
         columns = jnp.maximum(state.learned, 1)

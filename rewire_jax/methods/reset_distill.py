@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from rewire_jax.core.pytrees import at, count, tile
+from rewire_jax.core.pytrees import at, count, learned_place, tile
 from rewire_jax.core.settings import (
     require,
     require_counts,
@@ -140,8 +140,7 @@ def reset_distill(spec: Spec, options: ResetDistillSettings) -> Method:
 
     def policy(params, state, task):
         del params
-        latest = jnp.maximum(state.learned - 1, 0)
-        return layers(state.offline, jnp.minimum(task % slots, latest))
+        return layers(state.offline, learned_place(task % slots, state.learned))
 
     return plain._replace(
         init=init,

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.pytrees import learned_place
 from rewire_jax.methods import wiring
 from rewire_jax.methods.rewire_settings import RewireSettings
 from rewire_jax.methods.spec import Spec
@@ -101,5 +102,5 @@ class Design(NamedTuple):
         return state.learned % self.slots
 
     def known_slot(self, state: State, task: jax.Array) -> jax.Array:
-        """`[]`, that of a task's earlier round or, if it is new, the latest."""
-        return jnp.minimum(task % self.slots, jnp.maximum(state.learned - 1, 0))
+        """`[]`, see `learned_place`."""
+        return learned_place(task % self.slots, state.learned)
