@@ -25,8 +25,9 @@ PYTHONS := python3.11 python3.12 python3.13
 PYTHON ?= $(shell for python in $(PYTHONS) python3; do \
 	"$$python" -c '' 2>/dev/null && break; done; echo "$$python")
 RUN = $(VENV)/bin/python
-# A file's tests share what they train, so they stay in one process.
-WORKERS ?= -n 2 --dist loadfile
+# A file's tests share what they train, so they stay in one process. tests/conftest.py
+# orders the files.
+WORKERS ?= -n 2 --dist loadfile --no-loadscope-reorder
 
 comma := ,
 # $(call option,NAME,VALUE): `--NAME VALUE` if VALUE is set, else nothing.

@@ -26,6 +26,18 @@ os.environ.setdefault("XLA_FLAGS", _FLAGS)
 gc.set_threshold(100_000, 50, 50)
 
 
+# Long files first, so that no process waits long for another one at the end.
+_ORDER = "docs", "training", "run", "envs", "methods", "cli", "experiments", "rendering"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    def place(item: pytest.Item) -> int:
+        folder = item.path.parent.name
+        return _ORDER.index(folder) if folder in _ORDER else len(_ORDER)
+
+    items.sort(key=place)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
     """Frees a file's compiled programs after it.
