@@ -38,6 +38,9 @@ def main(words: Sequence[str] | None = None) -> None:
         sys.unraisablehook = _unraisable
         # Orbax leaves coroutines behind where it fails.
         warnings.filterwarnings("ignore", "coroutine .* was never awaited")
+    # Streams may be closed, as by `>&-`.
+    sys.stdout = sys.stdout or io.StringIO()
+    sys.stderr = sys.stderr or io.StringIO()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where a terminal knows ASCII only
@@ -53,7 +56,8 @@ def main(words: Sequence[str] | None = None) -> None:
         if debug:
             traceback.print_exc()
         line, status = _ending(error)
-        print(line, file=sys.stderr)
+        with contextlib.suppress(OSError):
+            print(line, file=sys.stderr)
         sys.exit(status)
 
 

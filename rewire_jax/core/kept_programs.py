@@ -27,6 +27,17 @@ _folder: Path | None = None
 _names: dict[Function, str] = {}
 
 
+def _read_code() -> str:
+    """Digest of this package's files."""
+    code = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        code.update(path.read_bytes())
+    return code.hexdigest()
+
+
+_CODE = _read_code()
+
+
 def keep_in(folder: Path | None) -> None:
     """Sets the folder of programs; None keeps no more of them.
 
@@ -95,17 +106,9 @@ def _shape(leaf: Any) -> tuple[Any, ...]:
 @functools.cache
 def _origin() -> str:
     """What a program depends on besides its function, arguments and configuration."""
-    code = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        code.update(path.read_bytes())
     device = jax.devices()[0]
-    return repr(
-        (
-            code.hexdigest(),
-            [(name, _version(name)) for name in _PACKAGES],
-            (device.platform, device.device_kind),
-        )
-    )
+    versions = [(name, _version(name)) for name in _PACKAGES]
+    return f"{_CODE} {versions} {device.platform} {device.device_kind}"
 
 
 def _configuration() -> str:
@@ -137,12 +140,18 @@ def _make(
         # Classes of pytrees are found again by their names.
         result = jax.tree.unflatten(results[0], [0] * results[0].num_leaves)
         content = pickle.dumps((bytes(exported.serialize()), result))
-        _write(path, hashlib.sha256(content).digest() + content)
+        if _read_code() == _CODE:  # else the files are no longer those that run
+            _write(path, _digest(path, content) + content)
     # Whatever cannot be exported or written is traced and compiled as usual, and an
     # error of the function itself is then raised there.
     except Exception:
         return None
     return _program(exported, results[0])
+
+
+def _digest(path: Path, content: bytes) -> bytes:
+    """32 bytes that tell a whole file under its own name."""
+    return hashlib.sha256(path.name.encode() + content).digest()
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -155,9 +164,11 @@ def _write(path: Path, content: bytes) -> None:
 
 def _read(path: Path) -> Function | None:
     """The program in a file; None if there is none, or it is damaged."""
+    if not path.is_file():
+        return None
     try:
         digest, content = (held := path.read_bytes())[:32], held[32:]
-        if hashlib.sha256(content).digest() != digest:
+        if _digest(path, content) != digest:
             return None
         program, result = pickle.loads(content)
         exported = jax.export.deserialize(bytearray(program))

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings, flag, require
+from rewire_jax.core.settings import MOST_SEEDS, Settings, flag, require
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.storage.json_lines import raw
 from rewire_jax.training.presets import preset
@@ -136,7 +136,7 @@ def read_campaign(file: str | Path) -> Campaign:
         try:
             text = raw(path).decode()
             data = tomllib.loads(text)
-        except ValueError as error:  # of TOML or of UTF-8
+        except (ValueError, RecursionError) as error:  # of TOML or of UTF-8
             raise UserError(f"it is not TOML: {error}") from error
         _check(data, _KEYS)
         require(bool(data.get("runs")), "it has no [[runs]]")
@@ -213,9 +213,14 @@ def _runs(entry: Any) -> Iterator[Run]:
         words = bool(names) and all(isinstance(name, str) for name in names)
         require(words, f"{key} must be a list of names")
     seeds = entry.get("seeds", 1)
-    seeds = list(range(seeds)) if isinstance(seeds, int) else seeds
-    whole = all(type(seed) is int and seed >= 0 for seed in seeds)
-    require(bool(seeds) and whole, "seeds must be a number, or a list of numbers")
+    if isinstance(seeds, int):
+        require(seeds <= MOST_SEEDS, f"seeds must be at most {MOST_SEEDS}, not {seeds}")
+        seeds = list(range(seeds))
+    whole = all(type(seed) is int and 0 <= seed < 2**31 for seed in seeds)
+    require(
+        bool(seeds) and whole,
+        "seeds must be a number, or a list of numbers from 0 to 2147483647",
+    )
     name, methods = entry.get("name"), entry["methods"]
     require(not name or len(methods) == 1, "name needs an entry with one method")
     for scenario in entry["scenarios"]:

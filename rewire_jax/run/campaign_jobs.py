@@ -58,7 +58,7 @@ class Job:
     @property
     def done(self) -> bool:
         """Whether the run is finished; then its checkpoints may be deleted."""
-        if (self.folder / "checkpoints").exists():
+        if self.started and (self.folder / "checkpoints").exists():
             return run_state.finished(self.folder, self.run.settings.tasks - 1)
         try:
             return self.started and read_run(self.folder).complete

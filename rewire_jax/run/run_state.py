@@ -133,8 +133,8 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
     """Returns the newest state whose checkpoint and rows are complete, or None.
 
     Removes rows of the tables that were written after this checkpoint. If it is not the
-    newest one, or there is none, copies of the tables are kept: their rows may not be
-    computed again as they were.
+    newest one, or there is none, or evaluations came after it, copies of the tables are
+    kept: their rows may not be computed again as they were.
 
     Args:
       folder: folder of the run.
@@ -154,7 +154,7 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
             continue
         changed = run_folder.changed(folder, marks)
         if not changed:
-            if path != found[0]:
+            if path != found[0] or run_folder.results_after(folder, marks):
                 _keep_copies(folder, marks, say)
             run_folder.cut(folder, marks)
             return standing

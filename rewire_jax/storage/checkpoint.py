@@ -66,7 +66,7 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for left_over in path.parent.glob(f"{_TEMPORARY}*"):
-            shutil.rmtree(left_over)
+            _clear(left_over)
         temporary.mkdir()
         for name, tree in items.items():
             _write_item(temporary / name, tree)
@@ -78,8 +78,7 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
         (temporary / _MANIFEST).write_text(json.dumps(manifest, indent=1))
         for entry in [*temporary.rglob("*"), temporary]:
             _sync(entry)
-        if path.exists():
-            shutil.rmtree(path)
+        _clear(path)
         temporary.rename(path)
         _sync(path.parent)
     except (OSError, ValueError) as error:  # TensorStore's are ValueErrors.
@@ -89,6 +88,14 @@ def save(path: Path, items: Mapping[str, Any], metadata: Mapping[str, Any]) -> N
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _clear(path: Path) -> None:
+    """Deletes what stands in the way: a folder, or a file or link by itself."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def load(

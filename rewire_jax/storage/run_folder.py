@@ -164,6 +164,7 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
     temporary = path.with_name(f".{path.name}")
     try:
         with writing(path):
+            temporary.unlink(missing_ok=True)  # A link would lead elsewhere.
             temporary.write_text(json.dumps(content, indent=1) + "\n")
             temporary.rename(path)
     finally:
@@ -282,6 +283,12 @@ def changed(folder: Path, marks: Mapping[str, Mark]) -> Path | None:
         if len(held) < length or (digest and _digest(held) != digest):
             return folder / table
     return None
+
+
+def results_after(folder: Path, marks: Mapping[str, Mark]) -> bool:
+    """Whether evaluations were written after `marks` were taken."""
+    table = TABLES[0]
+    return len(_bytes(folder / table)) > _parts(marks.get(table, 0))[0]
 
 
 def copies(folder: Path, marks: Mapping[str, Mark]) -> list[Path]:

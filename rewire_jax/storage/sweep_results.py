@@ -179,7 +179,15 @@ def read_batches(path: Path) -> tuple[list[list[int]], int]:
     """
     read = document(path)
     with reading(path):
-        return [[int(m) for m in b] for b in read["batches"]], int(read["size"])
+        batches, size = read["batches"], read["size"]
+        members = [member for batch in batches for member in batch]
+        if not members or not all(type(number) is int for number in (*members, size)):
+            raise ValueError("batches are lists of numbers of members")
+        if len(set(members)) < len(members):
+            raise ValueError("a member is in two batches")
+        if not 1 <= max(map(len, batches)) <= size:
+            raise ValueError(f"batches of {size} slots do not fit")
+        return batches, size
 
 
 def _batches(

@@ -1,5 +1,6 @@
 """Acting by what was learned, without exploration."""
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -42,6 +43,16 @@ def mean_action(
     return jnp.tanh(mean)
 
 
+def _check_task(task: Any, tasks: int) -> None:
+    """Raises `ValueError` if this is no place of a task."""
+    try:
+        place = -1 if isinstance(task, bool) else operator.index(task)
+    except TypeError:
+        place = -1
+    if not 0 <= place < tasks:
+        raise ValueError(f"task must be 0 to {tasks - 1}, not {task}")
+
+
 def act_function(method: Method, spec: Spec) -> Act:
     """How to act by what a method, made from this spec, has learned."""
     like = Learned(*jax.eval_shape(method.init, jax.random.key(0)))
@@ -49,8 +60,8 @@ def act_function(method: Method, spec: Spec) -> Act:
     def act(
         learned: Learned, task: jax.Array | int, observation: jax.Array
     ) -> jax.Array:
-        if isinstance(task, int) and not 0 <= task < spec.tasks:
-            raise ValueError(f"task must be 0 to {spec.tasks - 1}, not {task}")
+        if not isinstance(task, jax.core.Tracer):
+            _check_task(task, spec.tasks)
         chex.assert_trees_all_equal_shapes(learned, like)
         policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
         return mean_action(method, spec, policy, observation)

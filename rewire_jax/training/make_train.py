@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rewire_jax.core.settings import SacSettings, Settings, require, with_traced
 from rewire_jax.envs.base import Environment, Task
@@ -129,6 +130,9 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
             with_traced(settings.options, options or settings.options),
         )
         numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), given)
+        kind = getattr(key, "dtype", np.dtype(object))
+        if not jnp.issubdtype(kind, jax.dtypes.prng_key):  # else it is taken for two
+            raise ValueError("the key must be one of jax.random.key")
         member = Members(key, *numbers)
         return _Training(settings, functions, budget, tasks, member).run()
 

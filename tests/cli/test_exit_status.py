@@ -109,3 +109,19 @@ def test_a_terminal_may_know_ascii_only() -> None:
         assert done.returncode == (0 if "--help" in words else 2)
         assert b"unexpected" not in done.stderr
         assert b"Traceback" not in done.stderr
+
+
+def test_closed_streams_are_no_error() -> None:
+    for closed, code in ((">&-", 0), ("2>&-", 0), (">&- 2>&-", 0)):
+        line = " ".join(LIST) + f" {closed}"
+        done = subprocess.run(line, shell=True, capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (code, "")
+
+
+@pytest.mark.parametrize("where", ["2>&-", "2>/dev/full"])
+def test_an_error_that_cannot_be_told_keeps_its_status(where: str) -> None:
+    words = [*LIST[:-1], "info", "nope"]
+    done = subprocess.run(
+        " ".join(words) + f" {where}", shell=True, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (2, "")

@@ -1,6 +1,7 @@
 """Programs that are found again are not traced, and compute the same."""
 
 import functools
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -88,7 +89,7 @@ def test_another_name_or_configuration_has_another_program():
     assert (other.traced, configured.traced) == (1, 1)
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "folder"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "folder", "fifo"])
 def test_damage_is_traced_anew(folder, damage):
     result(Process())
     (path,) = folder.iterdir()
@@ -96,12 +97,32 @@ def test_damage_is_traced_anew(folder, damage):
     path.unlink()
     if damage == "folder":
         path.mkdir()
+    elif damage == "fifo":
+        os.mkfifo(path)
     else:
         content[len(content) // 2] ^= 1
         path.write_bytes(content if damage == "flipped" else content[:-10])
     process = Process()
     np.testing.assert_allclose(result(process).left, expected(), rtol=1e-6)
     assert process.traced > 0
+
+
+def test_a_program_under_another_name_is_not_used(folder):
+    result(Process())
+    (first,) = folder.iterdir()
+    other = Process("g")
+    result(other)
+    (second,) = {*folder.iterdir()} - {first}
+    second.write_bytes(first.read_bytes())
+    process = Process("g")
+    result(process)
+    assert process.traced > 0
+
+
+def test_nothing_is_kept_of_code_that_has_changed_since(folder, monkeypatch):
+    monkeypatch.setattr(kept_programs, "_read_code", lambda: "edited")
+    np.testing.assert_allclose(result(Process()).left, expected(), rtol=1e-6)
+    assert not folder.exists()
 
 
 def test_memory_is_given_on():

@@ -68,6 +68,34 @@ def test_a_fallback_keeps_a_copy_and_a_plain_resume_none(
     assert rows(run) == rows(trained)
 
 
+def test_evaluations_after_the_newest_checkpoint_are_kept_as_a_copy(
+    run: Path, trained: Path
+) -> None:
+    shutil.rmtree(run / "checkpoints/task-002")
+    rewire_jax.train(small(), run, resume=True)
+    assert copies(run, "results.jsonl") == [rows(trained)]
+    assert rows(run) == rows(trained)
+
+
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_what_stands_in_a_checkpoints_way_is_replaced(
+    kind: str, run: Path, trained: Path, tmp_path: Path
+) -> None:
+    path, outside = run / "checkpoints/task-002", tmp_path / "outside"
+    path.rename(outside)
+    if kind == "file":
+        path.touch()
+    else:
+        (outside / "manifest.json").unlink()
+        path.symlink_to(outside)
+    before = {p: p.read_bytes() for p in outside.rglob("*") if p.is_file()}
+    rewire_jax.train(small(), run, resume=True)
+    assert rows(run) == rows(trained)
+    assert path.is_dir()
+    assert not path.is_symlink()
+    assert {p: p.read_bytes() for p in before} == before
+
+
 @pytest.mark.parametrize("change", [{"seed": 5}, {"warmup": 320}])
 def test_another_runs_checkpoint_is_never_used(
     change: dict, run: Path, trained: Path

@@ -177,3 +177,14 @@ def test_rows_that_are_lost_or_others_are_noticed(tmp_path: Path, text: str) -> 
     lengths = {"results.jsonl": 18}
     noticed = run_folder.changed(tmp_path, lengths) is not None
     assert noticed == (len(text) < 18)
+
+
+def test_a_header_is_not_written_through_a_link(tmp_path):
+    outside = tmp_path / "outside"
+    outside.write_text("precious")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / ".settings.json").symlink_to(outside)
+    run_folder.write(folder / "settings.json", {"a": 1})
+    assert outside.read_text() == "precious"
+    assert not (folder / "settings.json").is_symlink()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.storage.sweep_results import read_sweep
+from rewire_jax.storage.sweep_results import read_batches, read_sweep
 from tests.fake_run import replace_line, write_run
 from tests.fake_sweep import GRID, TASKS, choice, score, write_sweep
 
@@ -173,3 +173,22 @@ def test_other_folders_are_told_apart(tmp_path):
         read_sweep(run)
     with pytest.raises(UserError, match=r"no settings\.json"):
         read_sweep(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"size": 2, "batches": [[0, 1], [0, 1]]},
+        {"size": 0, "batches": []},
+        {"size": -1, "batches": [[0]]},
+        {"size": 1, "batches": [[0, 1]]},
+        {"size": 2, "batches": [[0.5, 1]]},
+        {"size": 2.0, "batches": [[0, 1]]},
+        {"size": 2, "batches": [[True, 0]]},
+    ],
+)
+def test_batches_that_cannot_be_are_refused(tmp_path, content):
+    path = tmp_path / "batches.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=str(path)):
+        read_batches(path)

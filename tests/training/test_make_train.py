@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 
 import rewire_jax
 from rewire_jax import UserError, make_act, make_scenario, make_train
+from rewire_jax.training.acting import Learned
 from tests.tiny import rows, tiny
 
 
@@ -125,3 +127,20 @@ def test_environments_on_the_host_are_refused() -> None:
     settings = tiny(scenario, "ft1")
     with pytest.raises(UserError, match="train"):
         make_train(settings, scenario)
+
+
+@pytest.mark.parametrize(
+    "task", [2, -1, np.int64(7), jnp.int32(9), 1.5, np.nan, True, "0", np.arange(2)]
+)
+def test_a_task_that_is_not_there_has_no_action(task: Any) -> None:
+    settings = tiny(method="ft1")
+    scenario = make_scenario("probe/reach")
+    settings = dataclasses.replace(settings, tasks=2)
+    with pytest.raises(ValueError, match="task"):
+        make_act(settings, scenario)(Learned((), ()), task, jnp.zeros(2))
+
+
+@pytest.mark.parametrize("key", [jax.random.PRNGKey(0), 0, None])
+def test_a_key_of_another_kind_is_refused(key: Any) -> None:
+    with pytest.raises(ValueError, match="key"):
+        make_train(tiny(method="ft1"))(key)
