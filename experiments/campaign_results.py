@@ -71,9 +71,11 @@ def keep_runs(jobs: Sequence[Job], folder: Path) -> None:
         if path.exists():
             continue
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tarfile.open(path, "x:xz") as file:
+        part = path.with_suffix(".part")
+        with tarfile.open(part, "w:xz") as file:
             for name in (HEADER, *TABLES):
                 file.add(job.folder / name, name, filter=anonymous)
+        part.rename(path)
 
 
 def restore_runs(jobs: Sequence[Job], folder: Path) -> None:
@@ -81,9 +83,10 @@ def restore_runs(jobs: Sequence[Job], folder: Path) -> None:
     for job in jobs:
         path = archive(job, folder)
         if path.exists() and not job.started:
-            job.folder.mkdir(parents=True)
+            part = job.folder.with_name(f".{job.folder.name}.part")
             with tarfile.open(path) as file:
-                file.extractall(job.folder, filter="data")
+                file.extractall(part, filter="data")
+            part.rename(job.folder)
 
 
 def run(job: Kept) -> None:

@@ -13,6 +13,7 @@ from rewire_jax.core import kept_programs
 
 OFF = "off"
 VARIABLE = "REWIRE_JAX_CACHE"  # in the environment, the default of `folder`
+_JAX_VARIABLE = "JAX_COMPILATION_CACHE_DIR"
 # A cache that fails must not stop the program.
 _FAILURES = "Error (reading|writing) persistent compilation cache entry"
 
@@ -79,6 +80,6 @@ def environment() -> dict[str, str]:
     told = jax.config.values
     if not told["jax_enable_compilation_cache"]:
         return {VARIABLE: OFF}
-    if kept_programs.programs_kept():
-        return {VARIABLE: told["jax_compilation_cache_dir"]}
-    return {}  # JAX's own setting, or no folder at all
+    variable = VARIABLE if kept_programs.programs_kept() else _JAX_VARIABLE
+    folder = told["jax_compilation_cache_dir"]
+    return {variable: folder} if folder else {}

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import MOST_SEEDS, Settings, flag, require
+from rewire_jax.core.settings import MOST_SEEDS, Settings, flag, require, validate
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.storage.json_lines import raw
 from rewire_jax.training.presets import preset
@@ -216,16 +216,14 @@ def _runs(entry: Any) -> Iterator[Run]:
     if isinstance(seeds, int):
         require(seeds <= MOST_SEEDS, f"seeds must be at most {MOST_SEEDS}, not {seeds}")
         seeds = list(range(seeds))
-    whole = all(type(seed) is int and 0 <= seed < 2**31 for seed in seeds)
-    require(
-        bool(seeds) and whole,
-        "seeds must be a number, or a list of numbers from 0 to 2147483647",
-    )
+    whole = all(type(seed) is int and seed >= 0 for seed in seeds)
+    require(bool(seeds) and whole, "seeds must be a number, or a list of numbers")
     name, methods = entry.get("name"), entry["methods"]
     require(not name or len(methods) == 1, "name needs an entry with one method")
     for scenario in entry["scenarios"]:
         for method in methods:
             settings, flags = _settings(entry, scenario, method)
+            validate(dataclasses.replace(settings, seed=max(seeds)))
             called = name or method
             require(bool(slug(called)), f"name {called!r} needs a letter or a digit")
             for turn, seed in enumerate(seeds):

@@ -154,7 +154,8 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
             continue
         changed = run_folder.changed(folder, marks)
         if not changed:
-            if path != found[0] or run_folder.results_after(folder, marks):
+            later = run_folder.longer(folder, marks)
+            if path != found[0] or "results.jsonl" in later:
                 _keep_copies(folder, marks, say)
             run_folder.cut(folder, marks)
             return standing

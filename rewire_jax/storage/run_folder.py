@@ -285,10 +285,10 @@ def changed(folder: Path, marks: Mapping[str, Mark]) -> Path | None:
     return None
 
 
-def results_after(folder: Path, marks: Mapping[str, Mark]) -> bool:
-    """Whether evaluations were written after `marks` were taken."""
-    table = TABLES[0]
-    return len(_bytes(folder / table)) > _parts(marks.get(table, 0))[0]
+def longer(folder: Path, marks: Mapping[str, Mark]) -> dict[str, bytes]:
+    """The tables that were written to after `marks` were taken, as they are."""
+    held = {table: _bytes(folder / table) for table in TABLES}
+    return {t: x for t, x in held.items() if len(x) > _parts(marks.get(t, 0))[0]}
 
 
 def copies(folder: Path, marks: Mapping[str, Mark]) -> list[Path]:
@@ -299,13 +299,11 @@ def copies(folder: Path, marks: Mapping[str, Mark]) -> list[Path]:
     """
     made = []
     now = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
-    for table in TABLES:
-        held = _bytes(folder / table)
-        if len(held) > _parts(marks.get(table, 0))[0]:
-            copy = folder / f"{table}.{now}"
-            with writing(copy):
-                copy.write_bytes(held)
-            made.append(copy)
+    for table, held in longer(folder, marks).items():
+        copy = folder / f"{table}.{now}"
+        with writing(copy):
+            copy.write_bytes(held)
+        made.append(copy)
     return made
 
 

@@ -83,8 +83,7 @@ def rollout_function(
         assert keys.shape[1] == rows
         return play(environment, act, tasks, policies, keys, count)
 
-    if name:
-        name = f"{name} rollout {rows} {count} {score}"
+    name = name and f"{name} rollout {rows} {count} {score}"
     return population.compiled(episodes, (None, 0, 0), mesh, name=name)
 
 

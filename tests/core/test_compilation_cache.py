@@ -158,7 +158,7 @@ def test_another_process_gets_the_same_folder(tmp_path):
     off = ["None", "False {'REWIRE_JAX_CACHE': 'off'}"]
     first = [str(default), f"True {{'REWIRE_JAX_CACHE': '{default}'}}"]
     assert outs[0] == first + kept + kept + off + off + kept
-    theirs = [str(tmp_path / "told"), "False {}"]
+    theirs = [str(tmp_path / "told"), f"False {told}"]
     assert outs[1] == theirs + kept + kept + off + off + kept
 
 

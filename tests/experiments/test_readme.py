@@ -83,7 +83,7 @@ def test_every_committed_result_is_shown() -> None:
 def test_links_of_the_readme_lead_somewhere() -> None:
     text = (ROOT / "README.md").read_text()
     links = [re.split("#", link) for link in re.findall(r"\]\((.*?)\)", text)]
-    assert len(links) > 10
+    assert len(links) > 20
     for path, *anchor in links:
         assert (ROOT / path).exists(), path
         if anchor:

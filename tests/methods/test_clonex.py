@@ -50,7 +50,7 @@ def store(params, state, task, states):
 def moved(params, seed=0):
     rng = np.random.default_rng(seed)
     return jax.tree.map(
-        lambda x: x + rng.normal(0, 0.1, x.shape).astype(np.float32), params
+        lambda x: x + rng.normal(0, 0.3, x.shape).astype(np.float32), params
     )
 
 
@@ -77,14 +77,13 @@ def test_nothing_is_lost_right_after_a_task():
     assert penalty(params, state) == 0
     assert penalty(moved(params), state) == 0
     params, state = after_tasks(1)
-    # The policy's outputs are rounded otherwise than when they were stored.
-    assert abs(penalty(params, state)) < 1e-4 * penalty(moved(params), state)
+    np.testing.assert_allclose(penalty(params, state), 0, atol=1e-4)
     value, metrics = METHOD.penalty(KEY, moved(params), state, 0, None, None)
     np.testing.assert_allclose(value, C * metrics["cloning"], rtol=1e-6)
-    assert penalty(moved(params), state) > 0.01
+    assert penalty(moved(params), state) > 1
     # The weights of the first task and then of the second: only it is lost.
     params, state = after_tasks(2)
-    assert penalty(params, state) > 0.01
+    assert penalty(params, state) > 1
 
 
 def test_the_loss_trains_shared_layers_and_heads_of_earlier_tasks():

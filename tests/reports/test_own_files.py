@@ -72,10 +72,10 @@ def link_away(folder: Path) -> None:
 
 
 def files(folder: Path) -> dict[str, tuple[int, ...]]:
-    """What changes where a file is written or replaced."""
+    """All that the system knows of the files, but when they were read."""
     found = {path.name: path.lstat() for path in folder.iterdir()}
     return {
-        name: (stat.st_mode, stat.st_ino, stat.st_size, stat.st_mtime_ns)
+        name: (*stat[:7], stat.st_mtime_ns, stat.st_ctime_ns)
         for name, stat in found.items()
     }
 
