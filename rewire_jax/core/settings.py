@@ -229,7 +229,13 @@ _AT_LEAST: dict[str, float] = {
 _LARGEST = 2**31
 _LARGEST_FLOAT, _SMALLEST_FLOAT = 3.4e38, 1.2e-38
 MOST_SEEDS = 4_096
-_AT_MOST = {"seeds": MOST_SEEDS, "depth": 1_000}
+MOST_EPISODES = 2**20
+_AT_MOST = {
+    "seeds": MOST_SEEDS,
+    "depth": 1_000,
+    "eval_episodes": MOST_EPISODES,
+    "selection_episodes": MOST_EPISODES,
+}
 _POSITIVE = ("lr_policy", "lr_critic", "lr_temperature", "initial_temperature")
 _SHARE = ("discount", "target_rate")
 _KINDS: dict[Any, tuple[type, str]] = {
@@ -309,6 +315,10 @@ def validate(run: Settings) -> None:
             values[name] >= least,
             f"{flag(name)} must be at least {least:g}, not {values[name]}",
         )
+    last = run.seed + run.seeds - 1
+    require(
+        last < _LARGEST, f"--seed {run.seed}: the last seed would be {last}; lower it"
+    )
     for name in _POSITIVE:
         require(values[name] > 0, f"{flag(name)} must be above 0, not {values[name]}")
     for name in _SHARE:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 
+from rewire_jax.core.arguments import check_name
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs.geom_trajectory import Film
 
@@ -142,6 +143,7 @@ class TaskChange:
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_name("task", self.name)
         given = {n: getattr(self, n) for n in ("gravity", "friction", "hidden")}
         for name, value in {**given, **self.bodies, **self.actions}.items():
             try:

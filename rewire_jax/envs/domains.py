@@ -4,6 +4,8 @@ import difflib
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from rewire_jax.core.arguments import check_name
+from rewire_jax.core.errors import UserError
 from rewire_jax.envs import metaworld, probe
 from rewire_jax.envs.base import Domain, TaskChange
 from rewire_jax.envs.task_parameters import check_names
@@ -63,7 +65,17 @@ DOMAINS: dict[str, DomainKind] = {
 
 
 def register_domain(name: str, domain: Domain) -> None:
-    """Registers a domain for specs to name; it replaces one of the same name."""
+    """Registers a domain for specs to name; it replaces your own of the same name.
+
+    Raises:
+      UserError: it would replace a domain of this package, or an argument is of a wrong
+        kind.
+    """
+    check_name("domain", name)
+    if not isinstance(domain, Domain):
+        raise UserError(f"domain {name!r} must be a Domain, not {domain!r:.80}")
+    if name in DOMAINS and DOMAINS[name].backend != "own":
+        raise UserError(f"there is a domain named {name!r}: choose another name")
     DOMAINS[name] = DomainKind(lambda *_: domain, "own")
 
 

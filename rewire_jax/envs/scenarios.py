@@ -4,9 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rewire_jax.core.arguments import check_name, check_whole
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs.base import Environment, HostEnvironment, Task, TaskChange
 from rewire_jax.envs.domains import DOMAINS, unknown
+from rewire_jax.envs.metaworld import REWARDS
+from rewire_jax.envs.task_parameters import check_names
 
 
 @dataclass(frozen=True)
@@ -36,19 +39,13 @@ class ScenarioSpec:
     preset: str = ""
 
     def __post_init__(self) -> None:
+        check_name("scenario", self.name)
+        for name in ("repeats", "interactions"):
+            check_whole(f"{name} of scenario {self.name!r}", getattr(self, name), 1)
         if self.domain not in DOMAINS:
             raise UserError(unknown("domain", self.domain, list(DOMAINS)))
         if not self.changes:
             raise UserError(f"Scenario {self.name!r} needs at least one change.")
-        if self.repeats < 1:
-            raise UserError(
-                f"Scenario {self.name!r} needs repeats >= 1, not {self.repeats}."
-            )
-        if self.interactions < 1:
-            raise UserError(
-                f"Scenario {self.name!r} needs interactions >= 1, not"
-                f" {self.interactions}."
-            )
         if self.preset and self.preset not in SCENARIOS:
             raise UserError(unknown("preset", self.preset, list(SCENARIOS)))
         named = {change.name: change for change in self.changes}
@@ -117,7 +114,7 @@ def make_scenario(
     Args:
       spec: a spec, or the name of a known one.
       backend: physics backend, the domain's first if None; probes and registered
-        domains ignore it.
+        domains have only that.
       reward: version of Meta-World's rewards, `"v1"` or `"v2"`; others ignore it.
 
     Returns:
@@ -130,9 +127,12 @@ def make_scenario(
         if spec not in SCENARIOS:
             raise UserError(unknown("scenario", spec, list(SCENARIOS)))
         spec = SCENARIOS[spec]
+    check_names("reward", [reward], REWARDS)
     kind = DOMAINS[spec.domain]
-    if backend is None or kind.backend in ("probe", "own"):
+    if backend is None:
         backend = kind.backend
+    elif kind.backend in ("probe", "own") and backend != kind.backend:
+        raise UserError(f"{spec.name} has no other backend: drop --backend {backend}")
     domain = kind.make(spec.domain, spec.changes, backend, reward)
     names = list(dict.fromkeys(change.name for change in spec.changes))
     changes = {change.name: change for change in spec.changes}

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from rewire_jax.core import kept_programs
+from rewire_jax.core.arguments import check_name
 from rewire_jax.core.errors import UserError
 from rewire_jax.methods import (
     cka,
@@ -86,8 +87,11 @@ def register_method(name: str, entry: Entry) -> None:
     """Adds your own method; use it by its name, like the others.
 
     Raises:
-      UserError: another method has that name.
+      UserError: another method has that name, or an argument is of a wrong kind.
     """
+    check_name("method", name)
+    if not isinstance(entry, Entry):
+        raise UserError(f"method {name!r} must be an Entry, not {entry!r:.80}")
     if METHODS.get(name, entry) != entry:
         raise UserError(f"there is another method named {name!r}: choose another name")
     METHODS[name] = entry
@@ -95,7 +99,7 @@ def register_method(name: str, entry: Entry) -> None:
 
 def find_method(name: str) -> Entry:
     """The method of that name; `UserError` if there is none."""
-    if name not in METHODS:
+    if not isinstance(name, str) or name not in METHODS:
         raise UserError(
             f"unknown method {name!r}: choose one of {', '.join(sorted(METHODS))}"
         )

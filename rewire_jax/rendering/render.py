@@ -1,6 +1,5 @@
 """Plays an episode with a learned policy and renders it."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from rewire_jax.core.arguments import check_seconds, check_whole
 from rewire_jax.core.errors import UserError, writing
 from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
@@ -84,10 +84,8 @@ def render(
     """
     page = Path(out)
     require(page.suffix == ".html", f"--out {page}: a web page's name ends in .html")
-    require(
-        0 <= seconds < math.inf, f"--seconds must be a length of time, not {seconds}"
-    )
-    require(episode >= 0, f"--episode must be at least 0, not {episode}")
+    check_seconds("--seconds", seconds)
+    check_whole("--episode", episode)
     act = load_policy(run, task=task, seed=seed, stage=stage, member=member)
     folder = Path(run)
     _, settings = saved(folder, run_folder.kind(folder))

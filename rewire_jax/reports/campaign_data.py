@@ -12,6 +12,7 @@ from rewire_jax.run.campaign_file import Campaign, read_campaign
 from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of
 from rewire_jax.run.campaign_population import grouped
 from rewire_jax.run.campaign_status import Status, status
+from rewire_jax.run.header_check import check_header
 from rewire_jax.storage.result_files import Results, Rows
 from rewire_jax.storage.run_results import RunData, read_rows, read_run
 
@@ -98,6 +99,7 @@ def read_campaign_data(file: str | Path, out: str | Path | None = None) -> Campa
         if name not in known.done and not (job.folder / "results.jsonl").exists():
             continue
         try:
+            check_header(job.folder)
             evaluated[name] = read_rows(job.folder)
             if name in known.done:
                 run = read_run(job.folder)

@@ -9,6 +9,7 @@ from rewire_jax.reports import run_report, sweep_report
 from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import summarize
 from rewire_jax.reports.sweep_summary import summarize_sweep
+from rewire_jax.run.header_check import check_header
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.run_results import read_run
 from rewire_jax.storage.scores import SUCCESS, Success
@@ -43,6 +44,8 @@ def write_report(
     """
     known = ", ".join(SUCCESS)
     require(success in SUCCESS, f"unknown success {success!r}: choose one of {known}")
+    for folder in (*folders, *single):
+        check_header(Path(folder))
     report: Report[Any]
     if "sweep" in [run_folder.kind(Path(folder)) for folder in folders]:
         require(len(folders) == 1 and not single, "a sweep has a report of its own")

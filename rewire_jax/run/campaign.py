@@ -12,9 +12,15 @@ from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import check_seconds, check_whole
 from rewire_jax.run.campaign_file import read_campaign
-from rewire_jax.run.campaign_jobs import Job, Process, folder_of, jobs_of
+from rewire_jax.run.campaign_jobs import (
+    MOST_WORKERS,
+    Job,
+    Process,
+    folder_of,
+    jobs_of,
+)
 from rewire_jax.run.campaign_population import decide
 from rewire_jax.run.campaign_status import hours_left
 from rewire_jax.run.interrupts import Stopped
@@ -214,7 +220,9 @@ def campaign(
       UserError: something in the file is wrong, or a folder holds another run.
       Stopped: interrupted, and saved.
     """
-    require(workers >= 0, f"--workers must be at least 0, not {workers}")
+    check_whole("--workers", workers, 0, MOST_WORKERS)
+    if limit is not None:
+        check_seconds("--for", limit)
     made = read_campaign(file)
     root = folder_of(made, out)
     processes = workers or default_workers()

@@ -52,6 +52,7 @@ _RUN_KEYS: dict[str, type | tuple[type, ...]] = {
     "name": str,
     "settings": dict,
 }
+_LONGEST_NAME = 100  # letters: it names a folder
 # What an entry says in other words, or what a run derives.
 _NOT_SET = "scenario", "method", "profile", "backend", "seed", "seeds"
 _DERIVED = "paper_interactions", "sac", "options"
@@ -226,6 +227,8 @@ def _runs(entry: Any) -> Iterator[Run]:
             validate(dataclasses.replace(settings, seed=max(seeds)))
             called = name or method
             require(bool(slug(called)), f"name {called!r} needs a letter or a digit")
+            long = f"name {called[:20]!r}… is longer than {_LONGEST_NAME} letters"
+            require(len(slug(called)) <= _LONGEST_NAME, long)
             for turn, seed in enumerate(seeds):
                 yield Run(
                     configuration=called,

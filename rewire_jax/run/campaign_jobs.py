@@ -24,6 +24,7 @@ from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading, text
 from rewire_jax.storage.run_results import read_run
 
+MOST_WORKERS = 1_024
 _TRIES = 2  # after so many failures a run is set aside
 Process = subprocess.Popen[bytes]
 
@@ -172,6 +173,7 @@ def start(words: Sequence[str], log: Path, cores: Collection[int] = ()) -> Proce
       UserError: the log cannot be written.
     """
     run_folder.make(log.parent)
+    run_folder.refuse_link(log)
     with writing(log), log.open("ab") as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "rewire_jax.cli.attended", *words],

@@ -10,10 +10,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from rewire_jax.core.arguments import check_seconds, check_whole
 from rewire_jax.core.errors import UserError, writing
-from rewire_jax.core.settings import require
 from rewire_jax.run.campaign_file import read_campaign
-from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of
+from rewire_jax.run.campaign_jobs import MOST_WORKERS, Job, folder_of, jobs_of
 from rewire_jax.run.campaign_population import submitted_runs
 
 if TYPE_CHECKING:
@@ -96,7 +96,9 @@ def submit(
         raise UserError(
             'submitit is missing: pip install "rewire_jax[slurm]"'
         ) from error
-    require(workers >= 0, f"--workers must be at least 0, not {workers}")
+    check_whole("--workers", workers, 0, MOST_WORKERS)
+    if limit is not None:
+        check_seconds("--for", limit)
     made = read_campaign(file)
     root = folder_of(made, out)
     jobs = jobs_of(root, submitted_runs(made, root), retry)

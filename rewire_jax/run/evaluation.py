@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import check_optional, check_whole
+from rewire_jax.core.settings import MOST_EPISODES, require
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection
@@ -22,7 +23,6 @@ from rewire_jax.training.presets import preset
 from rewire_jax.training.run_setup import Plan, base_size, make_spec, prepare
 
 TaskLabel = Literal["given", "none"]
-_MOST_EPISODES = 2**20
 
 
 def info(scenario: Scenario) -> dict[str, Any]:
@@ -140,10 +140,11 @@ def evaluate(
       UserError: no such run or stage, a damaged checkpoint, or an argument out of
         range.
     """
-    require(
-        1 <= episodes <= _MOST_EPISODES,
-        f"--episodes must be 1 to {_MOST_EPISODES}, not {episodes}",
-    )
+    check_optional("--stage", stage)
+    check_whole("--episodes", episodes, 1, MOST_EPISODES)
+    check_whole("--seed", seed)
+    check_whole("--trials", trials, 1, MOST_EPISODES)
+    check_optional("--trial-steps", trial_steps, 1)
     require(
         task_label in get_args(TaskLabel),
         f"--task-label must be given or none, not {task_label}",

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rewire_jax.core.arguments import check_optional, check_whole
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings, require
 from rewire_jax.methods import find_method
@@ -17,11 +18,12 @@ from rewire_jax.methods.spec import Spec
 from rewire_jax.run import halving, run_state, sweep_members
 from rewire_jax.run.halving import Array
 from rewire_jax.run.run_state import saved
-from rewire_jax.run.sweep_grid import make_members
 from rewire_jax.run.sweep_members import Found
-from rewire_jax.storage import run_folder
+from rewire_jax.storage import fields, run_folder
+from rewire_jax.storage.json_lines import reading
 from rewire_jax.training import population
 from rewire_jax.training.acting import Act, Learned, act_function, mean_action
+from rewire_jax.training.run_setup import spec_of
 
 PolicyFunction = Callable[[jax.Array], jax.Array]
 """`[..., observations]` -> actions `[..., actions]` in [-1, 1]."""
@@ -53,6 +55,7 @@ class Policies(NamedTuple):
 
     def member(self, seed: int) -> Learned:
         """The member that was trained with a seed; `UserError` if there is none."""
+        check_whole("seed", seed)
         require(seed in self.seeds, f"there is no seed {seed}: see `seeds`")
         place = self.seeds.index(seed)
         return jax.tree.map(lambda leaf: leaf[place], self.members)
@@ -76,7 +79,7 @@ class Policies(NamedTuple):
         Raises:
           UserError: `trials` is not positive.
         """
-        require(trials >= 1, f"trials must be positive, not {trials}")
+        check_whole("trials", trials, 1)
 
         def returns(tasks: Array, playing: Array, round_: int) -> Array:
             del playing, round_  # one member: all candidates play
@@ -115,6 +118,9 @@ def load_policy(
     Raises:
       UserError: no such run, task, seed, member or stage, or a damaged checkpoint.
     """
+    check_whole("--task", task)
+    for name, value in (("--seed", seed), ("--stage", stage), ("--member", member)):
+        check_optional(name, value)
     folder = Path(run)
     kind = run_folder.kind(folder)
     header, settings, spec = _read(folder, kind)
@@ -128,8 +134,7 @@ def load_policy(
         if not 0 <= member < len(header["members"]):
             raise UserError(f"{folder} has no member {member}: see members.csv there")
         found = sweep_members.find(folder, member, stage)
-        told = header["members"][:: settings.seeds]
-        _, members = make_members(settings, [each["values"] for each in told])
+        members = sweep_members.members_of(folder, header, settings)
         owner = run_state.identity(settings, [members[n] for n in found.members])
         options = members[member].options
     else:
@@ -160,6 +165,7 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
     Raises:
       UserError: no such run or stage, a sweep, or a damaged checkpoint.
     """
+    check_optional("stage", stage)
     folder = Path(run)
     require(
         run_folder.kind(folder) == "run",
@@ -185,7 +191,10 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
 def _read(folder: Path, kind: str) -> tuple[dict[str, Any], Settings, Spec]:
     """A folder's header, its settings and its sizes."""
     header, settings = saved(folder, kind)
-    return header, settings, Spec(**header["spec"])
+    with reading(folder / run_folder.HEADER):
+        sizes = fields.checked(header["spec"], fields.SPEC)
+    spec = spec_of(settings, sizes["observations"], sizes["actions"])
+    return header, settings, spec
 
 
 def _load(found: Found, method: Method, owner: Mapping[str, Any]) -> Learned:

@@ -318,4 +318,9 @@ def saved(folder: Path, kind: str = "run") -> tuple[dict[str, Any], Settings]:
     header = run_folder.read_header(folder, kind)
     entry = find_method(header["settings"]["method"])
     with run_folder.telling_version(folder, header):
-        return header, from_json(header["settings"], entry.settings)
+        settings = from_json(header["settings"], entry.settings)
+    with reading(folder / run_folder.HEADER):
+        tasks = header["tasks"]
+        if len(tasks) != settings.tasks or not all(type(t) is str for t in tasks):
+            raise ValueError(f"tasks are not {settings.tasks} names")
+    return header, settings

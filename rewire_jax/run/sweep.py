@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rewire_jax.core.arguments import check_whole
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
 from rewire_jax.core.settings import Settings, require, validate
@@ -33,7 +34,14 @@ from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.ranking import rank
 from rewire_jax.run.run_state import RunState
-from rewire_jax.run.sweep_grid import draws, grid, make_members, read, values_of
+from rewire_jax.run.sweep_grid import (
+    describe,
+    draws,
+    grid,
+    make_members,
+    read,
+    values_of,
+)
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
@@ -264,9 +272,9 @@ def sweep(
       Stopped: interrupted, and saved.
     """
     folder = Path(out)
-    require(halving >= 1, f"--halving must be at least 1, not {halving}")
-    require(members_per_batch >= 0, "--members-per-batch must be at least 0")
-    require(random >= 0, f"--random must be at least 0, not {random}")
+    check_whole("--halving", halving, 1)
+    check_whole("--members-per-batch", members_per_batch)
+    check_whole("--random", random)
     validate(settings)
     loggers.check(log)
     given = {name: [float(x) for x in values] for name, values in (axes or {}).items()}
@@ -328,15 +336,7 @@ def _header(
       axes: names and values of the axes as given; if empty, the members' values.
       asked: other arguments of the sweep.
     """
-    told = [
-        {
-            "member": member.number,
-            "configuration": member.number // plan.settings.seeds,
-            "seed": member.seed,
-            "values": {name: read(member, name) for name in names},
-        }
-        for member in members
-    ]
+    told = describe(members, names, plan.settings.seeds)
     return {
         "kind": "sweep",
         "settings": to_json(plan.settings),

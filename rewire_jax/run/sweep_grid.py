@@ -122,6 +122,27 @@ def make_members(
     return dataclasses.replace(variants[0], options=together[0]), members
 
 
+def describe(
+    members: Sequence[Member], names: Sequence[str], seeds: int
+) -> list[dict[str, Any]]:
+    """What a sweep's header says of its members.
+
+    Args:
+      members: all members; the seeds of a configuration are consecutive.
+      names: names of the settings in which they differ.
+      seeds: number of seeds of each configuration.
+    """
+    return [
+        {
+            "member": member.number,
+            "configuration": member.number // seeds,
+            "seed": member.seed,
+            "values": {name: read(member, name) for name in names},
+        }
+        for member in members
+    ]
+
+
 def values_of(members: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
     """The values that each setting has among the members, in their order."""
     values: dict[str, list[float]] = {}

@@ -1,11 +1,17 @@
 """Where a member of a sweep is."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings import Settings
 from rewire_jax.run import run_state
+from rewire_jax.run.sweep_grid import describe, make_members
+from rewire_jax.storage import run_folder
+from rewire_jax.storage.json_lines import reading
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches
+from rewire_jax.training.population import Member
 
 
 class Found(NamedTuple):
@@ -43,3 +49,20 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
                 return Found(inside, each, place, num_slots, tuple(members))
     when = "any task" if stage is None else f"task {stage}"
     raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
+
+
+def members_of(
+    folder: Path, header: Mapping[str, Any], settings: Settings
+) -> tuple[Member, ...]:
+    """The members of a sweep, from its header.
+
+    Raises:
+      UserError: what the header says of the members does not fit together.
+    """
+    with reading(folder / run_folder.HEADER):
+        rows = list(header["members"])
+        values = [dict(row["values"]) for row in rows[:: settings.seeds]]
+        _, members = make_members(settings, values)
+        if describe(members, tuple(values[0]), settings.seeds) != rows:
+            raise ValueError("its members are not those of its configurations")
+    return members

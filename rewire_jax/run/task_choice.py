@@ -15,7 +15,6 @@ from rewire_jax.run.halving import Array
 from rewire_jax.training import population
 from rewire_jax.training.run_setup import Plan, prepare
 
-_MOST_TRIALS = 2**20
 # Splits of a key are folds by small numbers, which the evaluation uses.
 _TRIALS = np.uint32(2**31)
 
@@ -64,14 +63,10 @@ def choose(plan: Plan, policies: Any, finished: int, how: Trials) -> Choice:
       how: how to choose.
 
     Raises:
-      UserError: a number in `how` is out of range, or the memory is too small.
+      UserError: the trials are longer than an episode, or the memory is too small.
     """
     length = plan.scenario.environment.episode_length
     steps = length if how.steps is None else how.steps
-    require(
-        1 <= how.trials <= _MOST_TRIALS,
-        f"--trials must be 1 to {_MOST_TRIALS}, not {how.trials}",
-    )
     require(
         1 <= steps <= length,
         f"--trial-steps must be 1 to {length}, the length of an episode, not {steps}",

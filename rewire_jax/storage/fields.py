@@ -46,6 +46,10 @@ SETTINGS = {
 """Of a header's settings: what reports need."""
 
 
+SPEC = {"observations": Field(int, 1), "actions": Field(int, 1)}
+"""Of a header's sizes: those that its settings do not determine."""
+
+
 def results(tasks: int, stages: range) -> Fields:
     """Fields of `results.jsonl`, of so many tasks and of these stages."""
     return _OWNER | {

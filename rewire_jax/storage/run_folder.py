@@ -260,7 +260,7 @@ def compare(folder: Path, settings: Settings, kind: str = "run") -> None:
 
 def append(folder: Path, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
     """Adds rows to a table; `UserError` if it is a link or cannot be written."""
-    _refuse_link(folder / table)
+    refuse_link(folder / table)
     text = "".join(json.dumps(row) + "\n" for row in rows)
     with writing(folder / table), (folder / table).open("a") as file:
         file.write(text)
@@ -309,15 +309,17 @@ def copies(folder: Path, marks: Mapping[str, Mark]) -> list[Path]:
 
 def check_own(path: Path) -> None:
     """Raises `UserError` if a folder that is to be written in is a link or a file."""
-    _refuse_link(path)
+    refuse_link(path)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path} is not a folder of this run: move it away")
 
 
-def _refuse_link(path: Path) -> None:
+def refuse_link(path: Path) -> None:
     """Raises `UserError` for a link: nothing outside the folder is written."""
     if path.is_symlink():
         raise UserError(f"{path} is a link: replace it by what it names")
+    if path.is_file() and path.stat().st_nlink > 1:
+        raise UserError(f"{path} has another name elsewhere: replace it by a copy")
 
 
 def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
@@ -330,7 +332,7 @@ def cut(folder: Path, marks: Mapping[str, Mark]) -> None:
         path = folder / table
         length, _ = _parts(marks.get(table, 0))
         with writing(path):
-            _refuse_link(path)
+            refuse_link(path)
             if path.exists() and path.stat().st_size > length:
                 os.truncate(path, length)
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.settings import SacSettings, Settings, require, with_traced
+from rewire_jax.core.settings import SacSettings, Settings, require
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import find_method
@@ -28,6 +28,7 @@ from rewire_jax.training.run_setup import (
     complete,
     make_budget,
     make_functions,
+    with_values,
 )
 from rewire_jax.training.sac import TrainState
 
@@ -92,6 +93,11 @@ class Train(Protocol):
             in their traced values only; `jax.vmap` over them is a sweep. None for the
             given ones.
           options: the method's settings, in the same way.
+
+        Raises:
+          UserError: settings of another class, or an invalid value; values that JAX
+            traces are not checked.
+          ValueError: `key` is not one of `jax.random.key`.
         """
         ...
 
@@ -125,10 +131,7 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
     def train(
         key: jax.Array, sac: SacSettings | None = None, options: Any = None
     ) -> Trained:
-        given = (
-            with_traced(settings.sac, sac or settings.sac),
-            with_traced(settings.options, options or settings.options),
-        )
+        given = with_values(settings, sac, options)
         numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), given)
         kind = getattr(key, "dtype", np.dtype(object))
         if not jnp.issubdtype(kind, jax.dtypes.prng_key):  # else it is taken for two

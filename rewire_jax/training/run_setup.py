@@ -2,14 +2,22 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
 from rewire_jax.core.pytrees import count
-from rewire_jax.core.settings import Settings, flag, require, validate
+from rewire_jax.core.settings import (
+    SacSettings,
+    Settings,
+    flag,
+    require,
+    traced_fields,
+    validate,
+    with_traced,
+)
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.scenarios import Scenario, make_scenario
 from rewire_jax.methods import find_method
@@ -77,9 +85,14 @@ class Plan(NamedTuple):
 
 def make_spec(settings: Settings, environment: Environment | HostEnvironment) -> Spec:
     """Returns what a method is made from, besides its settings."""
+    return spec_of(settings, environment.observation_size, environment.action_size)
+
+
+def spec_of(settings: Settings, observations: int, actions: int) -> Spec:
+    """The same, from the sizes of the environment."""
     return Spec(
-        observations=environment.observation_size,
-        actions=environment.action_size,
+        observations=observations,
+        actions=actions,
         hidden=settings.sac.hidden,
         depth=settings.sac.depth,
         tasks=settings.tasks,
@@ -172,6 +185,45 @@ def complete(
                 f"task {task.name!r} has NaN in its {jax.tree_util.keystr(path)}",
             )
     return settings, scenario
+
+
+def with_values(
+    settings: Settings, sac: SacSettings | None, options: Any
+) -> tuple[SacSettings, Any]:
+    """Returns settings of SAC and of the method with the traced values of others.
+
+    Args:
+      settings: checked and complete.
+      sac: SAC's settings with the wanted values; None for the given ones.
+      options: the method's settings, in the same way.
+
+    Raises:
+      UserError: another class, or an invalid value. What JAX traces is not checked.
+    """
+    own = {"sac": settings.sac, "options": settings.options}
+    given = {"sac": sac or settings.sac, "options": options or settings.options}
+    known = {}
+    for part, values in given.items():
+        kind = type(own[part])
+        require(
+            isinstance(values, kind),
+            f"{part} must be a {kind.__name__}, not {values!r:.80}",
+        )
+        fixed = {}
+        for name in traced_fields(kind):
+            value = getattr(values, name)
+            if not isinstance(value, jax.core.Tracer):
+                shape = np.shape(value)
+                text = f"{flag(name)} has the shape {shape}: use jax.vmap over values"
+                require(not shape, text)
+                fixed[name] = value.item() if hasattr(value, "item") else value
+        known[part] = dataclasses.replace(own[part], **fixed)
+    validate(dataclasses.replace(settings, **known))
+    known["options"].checked()
+    return (
+        with_traced(settings.sac, given["sac"]),
+        with_traced(settings.options, given["options"]),
+    )
 
 
 def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:

@@ -192,3 +192,14 @@ def test_times(text, expected):
 def test_what_is_no_time(text):
     with pytest.raises(UserError):
         seconds(text)
+
+
+def test_a_log_is_not_written_through_a_link(tmp_path, file):
+    outside = tmp_path / "outside"
+    outside.write_text("mine")
+    job = Job(tmp_path / "c", read_campaign(file).runs[0])
+    job.notes.mkdir(parents=True)
+    (job.notes / "log.txt").symlink_to(outside)
+    with pytest.raises(UserError, match=r"log\.txt"):
+        job.start()
+    assert outside.read_text() == "mine"

@@ -109,6 +109,8 @@ OTHER = ENTRY.replace("ft1", "rewire")
         (ENTRY + "[runs.settings]\nbatch_size = 0\n", "line 1", "--batch-size"),
         (ENTRY + '[runs.settings]\nhidden = "wide"\n', "line 1", "hidden"),
         (ENTRY + 'name = "../.."\n', "line 1", "name"),
+        (ENTRY + f'name = "{"x" * 300}"\n', "line 1", "name"),
+        (ENTRY + 'backend = "v1"\n', "line 1", "--backend"),
         (
             ENTRY.replace('["ft1"]', '["ft1", "rewire"]') + 'name = "x"',
             "line 1",

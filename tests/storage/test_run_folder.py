@@ -188,3 +188,16 @@ def test_a_header_is_not_written_through_a_link(tmp_path):
     run_folder.write(folder / "settings.json", {"a": 1})
     assert outside.read_text() == "precious"
     assert not (folder / "settings.json").is_symlink()
+
+
+def test_a_table_with_another_name_elsewhere_is_not_written(tmp_path):
+    outside = tmp_path / "outside"
+    outside.write_text("{}\n")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "results.jsonl").hardlink_to(outside)
+    with pytest.raises(UserError, match="results"):
+        run_folder.append(folder, "results.jsonl", [{"a": 1}])
+    with pytest.raises(UserError, match="results"):
+        run_folder.cut(folder, {})
+    assert outside.read_text() == "{}\n"

@@ -144,3 +144,29 @@ def test_a_task_that_is_not_there_has_no_action(task: Any) -> None:
 def test_a_key_of_another_kind_is_refused(key: Any) -> None:
     with pytest.raises(ValueError, match="key"):
         make_train(tiny(method="ft1"))(key)
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "said"),
+    [
+        ("sac", {"lr_policy": -1.0}, "--lr-policy"),
+        ("sac", {"discount": np.nan}, "--discount"),
+        ("sac", {"lr_critic": jnp.ones(2)}, "--lr-critic"),
+        ("sac", {"lr_critic": "fast"}, "--lr-critic"),
+        ("options", {"modes": 4}, "--modes"),
+        ("options", {"tau": jnp.float32(0)}, "--tau"),
+    ],
+)
+def test_wrong_values_of_other_settings_are_refused(
+    part: str, changes: dict[str, Any], said: str
+) -> None:
+    settings = small("rewire")
+    given = {part: dataclasses.replace(getattr(settings, part), **changes)}
+    with pytest.raises(UserError, match=said):
+        make_train(settings)(jax.random.key(0), **given)
+
+
+@pytest.mark.parametrize("part", ["sac", "options"])
+def test_settings_of_another_class_are_refused(part: str) -> None:
+    with pytest.raises(UserError, match=part):
+        make_train(small("rewire"))(jax.random.key(0), **{part: small("rewire")})

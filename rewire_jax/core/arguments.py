@@ -1,0 +1,44 @@
+"""Checks of arguments that callers from Python give."""
+
+import math
+import numbers
+from typing import Any
+
+from rewire_jax.core.errors import UserError
+
+MOST = 2**31 - 1  # Counters have 32 bits.
+
+
+def check_whole(name: str, value: Any, least: int = 0, most: int = MOST) -> None:
+    """Raises `UserError` unless a value is a whole number in a range.
+
+    Args:
+      name: name of the argument; with dashes if it is a flag, too.
+      value: what was given.
+      least: the smallest allowed number.
+      most: the largest allowed number.
+    """
+    # In Python a bool is an int, too.
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not whole or not least <= value <= most:
+        limits = f"at least {least}" if most == MOST else f"{least} to {most}"
+        raise UserError(f"{name} must be a whole number, {limits}, not {value!r:.80}")
+
+
+def check_optional(name: str, value: Any, least: int = 0, most: int = MOST) -> None:
+    """The same as `check_whole`, but None is allowed."""
+    if value is not None:
+        check_whole(name, value, least, most)
+
+
+def check_seconds(name: str, value: Any) -> None:
+    """Raises `UserError` unless a value is a finite length of time, or 0."""
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not real or not 0 <= value < math.inf:
+        raise UserError(f"{name} must be a number of seconds, not {value!r:.80}")
+
+
+def check_name(kind: str, value: Any) -> None:
+    """Raises `UserError` unless a value can name something of this kind."""
+    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+        raise UserError(f"a {kind}'s name must be printable text, not {value!r:.80}")

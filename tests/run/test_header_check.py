@@ -1,0 +1,103 @@
+"""Headers that were changed after training."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rewire_jax
+from rewire_jax import UserError, write_report
+from rewire_jax.run.header_check import check_header
+from tests.small_sweep import run_sweep, small
+
+Header = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A run and a sweep."""
+    root = tmp_path_factory.mktemp("trained")
+    run_sweep(root / "sweep", small(seeds=2), axes={"beta": [1, 10]})
+    rewire_jax.train(small(seeds=2), root / "run")
+    return {"run": root / "run", "sweep": root / "sweep"}
+
+
+def changed(folder: Path, out: Path, change: Callable[[Header], Any]) -> Path:
+    """A copy with another header."""
+    shutil.copytree(folder, out)
+    path = out / "settings.json"
+    header = json.loads(path.read_text())
+    change(header)
+    path.write_text(json.dumps(header))
+    return out
+
+
+def swap(header: Header) -> None:
+    """Gives each configuration the other one's value."""
+    for row in header["members"]:
+        row["values"]["beta"] = 11 - row["values"]["beta"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("run", lambda h: h["settings"].update(interactions=640)),
+        ("run", lambda h: h["settings"]["sac"].update(discount=0.5)),
+        ("run", lambda h: h["settings"]["options"].update(beta=7.0)),
+        ("run", lambda h: h.update(tasks=["northeast"])),
+        ("run", lambda h: h.update(tasks="ab")),
+        ("sweep", swap),
+        ("sweep", lambda h: h["settings"].update(interactions=640)),
+        ("sweep", lambda h: h["members"][3].update(configuration=0)),
+        ("sweep", lambda h: h["members"][0].pop("values")),
+    ],
+)
+def test_a_changed_header_is_refused(
+    kind: str, change: Callable[[Header], Any], trained: dict[str, Path], tmp_path: Path
+) -> None:
+    copy = changed(trained[kind], tmp_path / "copy", change)
+    with pytest.raises(UserError, match=r"settings\.json"):
+        write_report([copy], tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_a_header_as_it_was_written_is_taken(
+    kind: str, trained: dict[str, Path], tmp_path: Path
+) -> None:
+    write_report([trained[kind]], tmp_path / "report")
+    # Nothing to compare with.
+    copy = changed(trained[kind], tmp_path / "copy", lambda h: h["settings"].update())
+    for path in copy.glob("**/checkpoints"):
+        shutil.rmtree(path)
+    check_header(copy)
+    # A method that is not registered here.
+    copy = changed(
+        trained[kind], tmp_path / "own", lambda h: h["settings"].update(method="own")
+    )
+    check_header(copy)
+
+
+@pytest.mark.parametrize(
+    "spec", [{}, {"observations": 0, "actions": 2}, {"observations": 2.5}, [2, 2]]
+)
+def test_sizes_in_a_header_are_checked(
+    spec: Any, trained: dict[str, Path], tmp_path: Path
+) -> None:
+    copy = changed(trained["run"], tmp_path / "copy", lambda h: h.update(spec=spec))
+    with pytest.raises(UserError, match=r"settings\.json"):
+        rewire_jax.load_policies(copy)
+
+
+def test_other_sizes_than_the_checkpoint_has(
+    trained: dict[str, Path], tmp_path: Path
+) -> None:
+    def grow(header: Header) -> None:
+        header["spec"]["observations"] += 1
+
+    copy = changed(trained["run"], tmp_path / "copy", grow)
+    with pytest.raises(UserError, match="does not fit"):
+        rewire_jax.load_policies(copy)
