@@ -69,7 +69,7 @@ def updates(
             return jax.tree.map(lambda x: x[number], batches)
 
         def draw(key):
-            return sac.sample_noise(
+            return sac.sample_update_noise(
                 key, learner.method_state, (), size, method, member.sac
             )
 

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import require, settings, static
 from rewire_jax.methods.base import Method
+from rewire_jax.methods.finetune import FinetuneSettings, ft1
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 
@@ -77,7 +78,6 @@ class State(NamedTuple):
 
 def packnet(spec: Spec, options: PackNetSettings) -> Method:
     """A task trains the free weights, prunes them, and finetunes those it keeps."""
-    act = networks.policy_of(spec.network)
 
     def init(key):
         params = networks.init_mlp(key, spec.sizes())
@@ -132,17 +132,11 @@ def packnet(spec: Spec, options: PackNetSettings) -> Method:
 
         return jax.tree.map(part, params, state.owners)
 
-    return Method(
+    return ft1(spec, FinetuneSettings())._replace(
         init=init,
-        distribution=lambda params, state, context, observation: act(
-            params, observation
-        ),
         policy=policy,
-        act=act,
         size=lambda params, state: jnp.asarray(count(params) + count(state.owners)),
-        hidden=lambda params, state, observation: networks.hidden_of(spec.network)(
-            params, observation
-        ),
+        redo_policy=False,
         adjust_updates=adjust_updates,
         consolidate=consolidate,
         offline=options.finetune,

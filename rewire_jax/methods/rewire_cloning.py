@@ -62,6 +62,7 @@ def loss(design: Design, key: jax.Array, params: Params, state: State) -> jax.Ar
     orders = wiring.refine(state.orders, params.adapters)
 
     def policy(slot, observation):
+        # States have different wirings: outputs are fewer than weights to reorder.
         x, below = observation, None
         for layer, order in zip(params.hidden, orders[slot], strict=True):
             x = networks.affine(layer, x)[order]

@@ -59,7 +59,7 @@ _DERIVED = "paper_interactions", "sac", "options"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class PlannedRun:
     """A configuration with one seed, or with several as a population.
 
     Attributes:
@@ -115,7 +115,7 @@ class Campaign:
     tuned_on: tuple[str, ...] | None
     population: Population
     submit: Mapping[str, Any]
-    runs: tuple[Run, ...]
+    runs: tuple[PlannedRun, ...]
 
 
 def slug(name: str) -> str:
@@ -153,7 +153,7 @@ def read_campaign(file: str | Path) -> Campaign:
         for number, line in enumerate(text.splitlines(), 1)
         if re.match(r"\s*\[\[\s*runs\s*\]\]", line)
     ]
-    seen: dict[str, Run] = {}
+    seen: dict[str, PlannedRun] = {}
     for number, entry in enumerate(data["runs"]):
         line = f", line {lines[number]}" if number < len(lines) else ""
         with _at(f"{path}{line}, [[runs]] number {number + 1}"):
@@ -170,9 +170,9 @@ def read_campaign(file: str | Path) -> Campaign:
     )
 
 
-def as_populations(runs: Sequence[Run]) -> list[Run]:
+def as_populations(runs: Sequence[PlannedRun]) -> list[PlannedRun]:
     """The same training with consecutive seeds of a configuration as one run."""
-    made: dict[tuple[str, str, int, int], Run] = {}
+    made: dict[tuple[str, str, int, int], PlannedRun] = {}
     for run in sorted(runs, key=lambda run: run.settings.seed):
         # Seeds minus turns are equal where seeds are consecutive.
         start = run.settings.seed - run.turn
@@ -206,7 +206,7 @@ def _check(table: Any, keys: Mapping[str, type | tuple[type, ...]]) -> None:
         require(fits, f"{key} has a value of a wrong type: {value!r:.80}")
 
 
-def _runs(entry: Any) -> Iterator[Run]:
+def _runs(entry: Any) -> Iterator[PlannedRun]:
     """The runs of an entry of the file."""
     _check(entry, _RUN_KEYS)
     for key in ("scenarios", "methods"):
@@ -230,7 +230,7 @@ def _runs(entry: Any) -> Iterator[Run]:
             long = f"name {called[:20]!r}… is longer than {_LONGEST_NAME} letters"
             require(len(slug(called)) <= _LONGEST_NAME, long)
             for turn, seed in enumerate(seeds):
-                yield Run(
+                yield PlannedRun(
                     configuration=called,
                     settings=dataclasses.replace(settings, seed=seed),
                     flags=flags,
@@ -265,7 +265,7 @@ def _settings(
     return prepare(settings, place).settings, {"method": method, **given, **values}
 
 
-def _add(run: Run, seen: dict[str, Run]) -> None:
+def _add(run: PlannedRun, seen: dict[str, PlannedRun]) -> None:
     """Adds a run to those before it.
 
     Raises:

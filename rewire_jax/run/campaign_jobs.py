@@ -19,7 +19,7 @@ from pathlib import Path
 from rewire_jax.core import compilation_cache
 from rewire_jax.core.errors import UserError, writing
 from rewire_jax.run import run_state
-from rewire_jax.run.campaign_file import Campaign, Run
+from rewire_jax.run.campaign_file import Campaign, PlannedRun
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading, text
 from rewire_jax.storage.run_results import read_run
@@ -39,7 +39,7 @@ class Job:
     """
 
     root: Path
-    run: Run
+    run: PlannedRun
 
     @property
     def folder(self) -> Path:
@@ -140,7 +140,7 @@ def folder_of(campaign: Campaign, out: str | Path | None) -> Path:
     return Path(out or Path("runs") / campaign.path.stem)
 
 
-def jobs_of(root: Path, runs: Sequence[Run], retry: bool = False) -> list[Job]:
+def jobs_of(root: Path, runs: Sequence[PlannedRun], retry: bool = False) -> list[Job]:
     """The jobs of runs in a campaign's folder.
 
     Args:

@@ -13,7 +13,7 @@ from typing import Any
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import require
-from rewire_jax.run.campaign_file import Campaign, Run, as_populations
+from rewire_jax.run.campaign_file import Campaign, PlannedRun, as_populations
 from rewire_jax.run.campaign_jobs import start
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading
@@ -24,7 +24,7 @@ _POLL = 1.0  # seconds, to wait for another process
 NAME = "population.json"
 
 
-def grouped(campaign: Campaign, root: Path) -> list[Run]:
+def grouped(campaign: Campaign, root: Path) -> list[PlannedRun]:
     """The runs of a campaign as its folder trains them, one for each seed if unknown.
 
     Raises:
@@ -43,7 +43,7 @@ def grouped(campaign: Campaign, root: Path) -> list[Run]:
 
 def decide(
     campaign: Campaign, root: Path, slots: Sequence[Collection[int]]
-) -> list[Run]:
+) -> list[PlannedRun]:
     """The runs to train; measures first which way is faster, if nobody has said so.
 
     Args:
@@ -68,7 +68,7 @@ def decide(
     return grouped(campaign, root)
 
 
-def submitted_runs(campaign: Campaign, root: Path) -> list[Run]:
+def submitted_runs(campaign: Campaign, root: Path) -> list[PlannedRun]:
     """The runs to submit to a cluster: of single seeds, if nobody has said so.
 
     A machine that submits may differ from those that train, so nothing is measured.
@@ -82,7 +82,9 @@ def submitted_runs(campaign: Campaign, root: Path) -> list[Run]:
     return grouped(campaign, root)
 
 
-def measure(run: Run, root: Path, slots: Sequence[Collection[int]]) -> dict[str, Any]:
+def measure(
+    run: PlannedRun, root: Path, slots: Sequence[Collection[int]]
+) -> dict[str, Any]:
     """Measures a run as a population, and its seeds side by side.
 
     Returns:

@@ -143,7 +143,7 @@ def _name(of: MemberFunctions, example: Any) -> str:
     functions = "reset", "step", "film"
     rest = [v for k, v in environment._asdict().items() if k not in functions]
     statics = jax.tree.structure(example)
-    return f"{domain} {rest} {method} {of.spec} {of.shape} {statics}"
+    return f"{domain} {rest} {method} {of.spec} {of.config} {statics}"
 
 
 def _over(

@@ -30,7 +30,7 @@ class ActionNoise(NamedTuple):
     blind: jax.Array
 
 
-def sample_noise(
+def sample_action_noise(
     key: jax.Array,
     time: jax.Array,
     size: tuple[int, int],

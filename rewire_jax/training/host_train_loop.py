@@ -89,12 +89,12 @@ def loop(
       mesh: the devices.
       traces: counts the traces of functions that training calls.
     """
-    environment, shape = of.environment, of.shape
+    environment, config = of.environment, of.config
     assert isinstance(environment, HostEnvironment)
     functions = _compile(of, mesh, traces)
 
     def first(members, index, task):
-        shaped = len(members.keys), shape.envs
+        shaped = len(members.keys), config.envs
         lanes = open_lanes(environment, shaped[0] * shaped[1])
         number = np.zeros(shaped, np.int32)
         seeds = host_episodes.seeds(np.asarray(functions.roots(members, index)), number)
@@ -108,7 +108,7 @@ def loop(
         return functions.begin(members, learner, active, index, episodes)
 
     def state_shape(members, learner, active, index, task):
-        number = np.zeros((len(members.keys), shape.envs), np.int32)
+        number = np.zeros((len(members.keys), config.envs), np.int32)
         observation = np.zeros((*number.shape, environment.observation_size))
         episodes = host_episodes.begin(
             environment, number, observation.astype(np.float32)
@@ -119,15 +119,15 @@ def loop(
 
     return Loop(
         begin=start,
-        chunk=functools.partial(_chunk, environment, functions, shape, mesh),
-        rollout=functools.partial(play, environment, shape.envs, act),
+        chunk=functools.partial(_chunk, environment, functions, config, mesh),
+        rollout=functools.partial(play, environment, config.envs, act),
         state_shape=state_shape,
     )
 
 
 def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Functions:
-    environment, shape = of.environment, of.shape
-    length, size = environment.episode_length, (shape.envs, environment.action_size)
+    environment, config = of.environment, of.config
+    length, size = environment.episode_length, (config.envs, environment.action_size)
 
     def roots(member, index):
         return jax.random.key_data(of.start_keys(member, index).reset)
@@ -137,7 +137,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
         sequences = None
         if sac.noise_color:
             # All sequences that these steps can need, each drawn once.
-            starts = time + length * jnp.arange((shape.update_every - 2) // length + 2)
+            starts = time + length * jnp.arange((config.update_every - 2) // length + 2)
             sequences = jax.vmap(
                 lambda start: exploration.sample_colored(key, start, size, length, sac)
             )(starts)
@@ -147,11 +147,11 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
             if sequences is not None:
                 sequence = sequences[now // length - time // length]
             collect_key = random_keys.of_step(key, now).collect
-            return exploration.sample_noise(
-                collect_key, now, size, shape.random_steps, sequence
+            return exploration.sample_action_noise(
+                collect_key, now, size, config.random_steps, sequence
             )
 
-        return jax.vmap(of_step)(time + jnp.arange(shape.update_every))
+        return jax.vmap(of_step)(time + jnp.arange(config.update_every))
 
     def act(members, draws, number, acting, extras, observation, steps):
         def one(member, draws, acting, extras, observation, steps):
@@ -167,16 +167,16 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
             at = time + number
             return train_loop.store(buffer, at, action, extras, step, length)
 
-        buffer = jax.lax.fori_loop(0, shape.update_every, store, buffer)
-        done = time + shape.update_every
+        buffer = jax.lax.fori_loop(0, config.update_every, store, buffer)
+        done = time + config.update_every
         step_keys = random_keys.of_step(of.keys(member, index).steps, done - 1)
         state, metrics = train_loop.update_from_buffer(
             step_keys.update,
             RunnerState(learner, CollectorState(buffer, (), ()), active),
             done,
-            shape.before(done),
-            shape.due(done),
-            updates=shape.updates,
+            config.before(done),
+            config.due(done),
+            updates=config.updates,
             environment=environment,
             method=of.method(member),
             settings=member.sac,
@@ -206,7 +206,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
             None,
             None,
             0,
-            donate=(2,) if shape.overlap else (1, 2),
+            donate=(2,) if config.overlap else (1, 2),
             traces=traces,
         ),
         inspect=over(inspect, 0, 0, 0, None, None),
@@ -216,7 +216,7 @@ def _compile(of: MemberFunctions, mesh: Mesh, traces: population.Traces) -> _Fun
 def _chunk(
     environment: HostEnvironment,
     functions: _Functions,
-    shape: LoopConfig,
+    config: LoopConfig,
     mesh: Mesh,
     members: Members,
     state: RunnerState,
@@ -226,7 +226,7 @@ def _chunk(
     steps: int,
 ) -> tuple[RunnerState, ChunkMetrics]:
     """Collects and updates for a chunk, a multiple of `LoopConfig.update_every`."""
-    assert steps % shape.update_every == 0
+    assert steps % config.update_every == 0
     learner, (buffer, episodes, extras), active, acting = state
     episodes = jax.tree.map(np.asarray, episodes)
     lanes = open_lanes(environment, episodes.steps.size)
@@ -242,10 +242,10 @@ def _chunk(
     made, metrics, updates = [], [], 0
     # JAX runs one thread's calls in order, so actions would wait for updates.
     with ThreadPoolExecutor(1) as other:
-        for start in range(time, time + steps, shape.update_every):
+        for start in range(time, time + steps, config.update_every):
             played = []
             draws = here(functions.draws(members, index, start))
-            for number in range(shape.update_every):
+            for number in range(config.update_every):
                 drawn, extras = functions.act(
                     actors,
                     draws,
@@ -262,7 +262,7 @@ def _chunk(
                 played.append((action, jax.tree.map(np.asarray, extras), step))
             along = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *played)
             made.append(along[2])
-            updates += int(shape.due(start + shape.update_every))
+            updates += int(config.due(start + config.update_every))
             if learning:
                 learner, buffer, active, values = learning.result()
                 metrics.append(values)
@@ -277,7 +277,7 @@ def _chunk(
                 start,
                 along,
             )
-            newest = before if shape.overlap else learning.result()[0]
+            newest = before if config.overlap else learning.result()[0]
             acting = here((newest.params, newest.method_state))
         learner, buffer, active, values = learning.result()
         metrics.append(values)
@@ -291,7 +291,7 @@ def _chunk(
         learner,
         CollectorState(buffer, episodes, extras),
         active,
-        population.place(acting, mesh) if shape.overlap else (),
+        population.place(acting, mesh) if config.overlap else (),
     ), report
 
 

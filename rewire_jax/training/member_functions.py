@@ -35,13 +35,13 @@ class MemberFunctions:
       environment: environment of the scenario.
       make: the method's constructor.
       spec: sizes of the networks and of the sequence.
-      shape: sizes of the training loop.
+      config: sizes of the training loop.
     """
 
     environment: Environment | HostEnvironment
     make: Callable[[Spec, Any], Method]
     spec: Spec
-    shape: LoopConfig
+    config: LoopConfig
 
     def method(self, member: Members) -> Method:
         """Returns the member's method."""
@@ -69,7 +69,7 @@ class MemberFunctions:
         task: Task,
     ) -> RunnerState:
         """Starts a task with compiled environments."""
-        keys = jax.random.split(self.start_keys(member, index).reset, self.shape.envs)
+        keys = jax.random.split(self.start_keys(member, index).reset, self.config.envs)
         environment = self.environment
         assert isinstance(environment, Environment)
         episodes = jax.vmap(lambda key: rollout.begin(environment, task, key))(keys)
@@ -95,13 +95,13 @@ class MemberFunctions:
         extras = method.extras(keys.extras, method_state, None, episodes.steps)
         buffer = replay_buffer.create(
             episodes.state.observation,
-            transitions=self.shape.transitions,
+            transitions=self.config.transitions,
             actions=self.spec.actions,
             episode_length=self.environment.episode_length,
             extras=extras,
         )
         learner = sac.restart(learner, member.sac)
-        acting = (params, method_state) if self.shape.overlap else ()
+        acting = (params, method_state) if self.config.overlap else ()
         collection = CollectorState(buffer, episodes, extras)
         return RunnerState(learner, collection, active, acting)
 
@@ -114,7 +114,7 @@ class MemberFunctions:
         learned = method.after_baseline(learner.params, learner.method_state, before)
         return state._replace(
             learner=learner.with_learned(learned),
-            acting=learned if self.shape.overlap else (),
+            acting=learned if self.config.overlap else (),
         )
 
     def chunk(
@@ -137,7 +137,7 @@ class MemberFunctions:
             environment=self.environment,
             method=self.method(member),
             settings=member.sac,
-            shape=self.shape,
+            config=self.config,
         )
 
     def consolidate(
@@ -179,7 +179,7 @@ class MemberFunctions:
         update = functools.partial(
             train_loop.update_from_buffer,
             due=True,
-            updates=self.shape.updates,
+            updates=self.config.updates,
             environment=self.environment,
             method=method,
             settings=method.offline_sac(member.sac),
@@ -187,9 +187,9 @@ class MemberFunctions:
         key = self.keys(member, index).offline
 
         def step(number, state):
-            first = number * self.shape.updates
+            before = number * self.config.updates
             step_key = jax.random.fold_in(key, number)
-            return update(step_key, state, time, first)[0]
+            return update(step_key, state, time, before)[0]
 
         return jax.lax.fori_loop(done, done + steps, step, state)
 

@@ -233,7 +233,7 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
       UserError: the scenario does not fit the settings.
     """
     environment = scenario.environment
-    shape = LoopConfig(
+    config = LoopConfig(
         envs=settings.envs,
         updates=settings.updates,
         warmup=settings.warmup // settings.envs,
@@ -250,12 +250,12 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
     )
     least = min(settings.interactions // settings.envs, environment.episode_length)
     require(
-        shape.transitions >= least or not hosted,
+        config.transitions >= least or not hosted,
         f"--buffer {settings.buffer} is too short for an episode, which --resume "
         f"replays from it: give at least {least * settings.envs}",
     )
     make = find_method(settings.method).make
-    return MemberFunctions(environment, make, make_spec(settings, environment), shape)
+    return MemberFunctions(environment, make, make_spec(settings, environment), config)
 
 
 def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:

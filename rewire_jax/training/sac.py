@@ -118,7 +118,7 @@ class UpdateNoise(NamedTuple):
     penalty: jax.Array
 
 
-def sample_noise(
+def sample_update_noise(
     key: jax.Array,
     method_state: MethodState,
     extras: Any,
@@ -254,13 +254,13 @@ def first_metrics(
     return metrics | {name: jnp.zeros(()) for name in names}
 
 
-def _every(delay, count, change, keep, value):
+def _every(delay, before, change, keep, value):
     """Changes a value in every `delay`-th update only."""
     if delay == 1:  # a branch would copy
         return change(value)
-    if isinstance(count, int):
-        return keep(value) if count % delay else change(value)
-    return jax.lax.cond(count % delay == 0, change, keep, value)
+    if isinstance(before, int):
+        return keep(value) if before % delay else change(value)
+    return jax.lax.cond(before % delay == 0, change, keep, value)
 
 
 def update(
@@ -268,7 +268,7 @@ def update(
     metrics: Metrics,
     batch: Batch,
     draw: UpdateNoise,
-    count: jax.Array | int,
+    before: jax.Array | int,
     method: Method,
     sac: SacSettings,
 ) -> tuple[TrainState, Metrics]:
@@ -279,7 +279,7 @@ def update(
       metrics: metrics of the previous update, kept if this update computes none.
       batch: `[batch, ...]` transitions.
       draw: the random draws.
-      count: `[]` int, updates made before in this task; shared by all members, so that
+      before: `[]` int, updates made before in this task; shared by all members, so that
         delayed updates stay branches (`cond`) under vmap. A Python int decides on
         them when it is traced; see `sac_updates`.
       method: the method.
@@ -295,7 +295,7 @@ def update(
     # Only what a branch changes goes through it: the rest would be copied.
     actor, policy = _every(
         sac.policy_delay,
-        count,
+        before,
         lambda actor: _update_policy(actor, learner, batch, draw, method, sac),
         lambda actor: (
             actor,
@@ -305,7 +305,7 @@ def update(
     )
     target = _every(
         sac.target_delay,
-        count,
+        before,
         lambda target: optax.incremental_update(critic, target, sac.target_rate),
         lambda target: target,
         learner.target,

@@ -37,7 +37,7 @@ def updates(
     learner: TrainState,
     draws: UpdateNoise,
     batch: Callable[[jax.Array], Batch],
-    first: jax.Array | int,
+    before: jax.Array | int,
     count: jax.Array | int,
     method: Method,
     settings: SacSettings,
@@ -49,7 +49,7 @@ def updates(
       learner: the member's learner.
       draws: `[count]` or more on every leaf.
       batch: `number -> Batch`, the transitions of an update.
-      first: `[]` int, updates made before in this task, a multiple of the group;
+      before: `[]` int, updates made before in this task, a multiple of the group;
         shared by all members, see `sac.update`.
       count: `[]` int, number of updates to make, a multiple of the group.
       method: the method.
@@ -57,14 +57,16 @@ def updates(
       group: 1, or a multiple of both delays, see `group_size`.
     """
 
-    def one(index, made, carry):
+    def one(number, before, carry):
         learner, metrics = carry
-        draw = jax.tree.map(lambda x: x[index], draws)
-        return sac.update(learner, metrics, batch(index), draw, made, method, settings)
+        draw = jax.tree.map(lambda x: x[number], draws)
+        return sac.update(
+            learner, metrics, batch(number), draw, before, method, settings
+        )
 
-    def several(number, carry):
+    def several(index, carry):
         for place in range(group):
-            carry = one(group * number + place, place, carry)
+            carry = one(group * index + place, place, carry)
         return carry
 
     draw = jax.tree.map(lambda x: x[0], draws)
@@ -74,6 +76,6 @@ def updates(
     return jax.lax.fori_loop(
         0,
         count,
-        lambda number, carry: one(number, first + number, carry),
+        lambda number, carry: one(number, before + number, carry),
         (learner, metrics),
     )

@@ -52,7 +52,7 @@ def collect(
     time: jax.Array,
     environment: Environment,
     method: Method,
-    shape: LoopConfig,
+    config: LoopConfig,
     sequence: jax.Array | None,
 ) -> tuple[CollectorState, rollout.Step]:
     """Makes one exploring vector step and stores it in the member's buffer.
@@ -62,9 +62,9 @@ def collect(
     """
     learner = state.learner
     buffer, episodes, extras = state.collection
-    size = shape.envs, environment.action_size
+    size = config.envs, environment.action_size
     action, extras = exploration.explore(
-        exploration.sample_noise(key, time, size, shape.random_steps, sequence),
+        exploration.sample_action_noise(key, time, size, config.random_steps, sequence),
         (learner.params, learner.method_state),
         extras,
         episodes.state.observation,
@@ -75,7 +75,7 @@ def collect(
     if environment.varied:
         # All episodes end at the same time, so `cond` computes the reset only then.
         reset_key = random_keys.named(CollectKeys, key).reset
-        keys = jax.random.split(reset_key, shape.envs)
+        keys = jax.random.split(reset_key, config.envs)
         starts = jax.lax.cond(
             (time + 1) % length == 0,
             lambda: jax.vmap(lambda k: environment.reset(task, k))(keys),
@@ -126,7 +126,7 @@ def no_metrics(
         batch = replay_buffer.sample(
             buffer, key, jnp.asarray(1), size[0], environment.episode_length
         )
-        draw = sac.sample_noise(
+        draw = sac.sample_update_noise(
             key, learner.method_state, batch.extras, size, method, settings
         )
         return sac.first_metrics(learner, batch, draw, method, settings)
@@ -139,7 +139,7 @@ def update_from_buffer(
     key: jax.Array,
     state: RunnerState,
     time: jax.Array,
-    first: jax.Array,
+    before: jax.Array,
     due: jax.Array | bool,
     *,
     updates: int,
@@ -156,7 +156,7 @@ def update_from_buffer(
       key: a random key.
       state: the member.
       time: `[]` int, vector steps made so far in this task.
-      first: `[]` int, updates made before in this task; shared by all members.
+      before: `[]` int, updates made before in this task; shared by all members.
       due: `[]` bool, shared by all members; if False, nothing is done.
       updates: number of updates in the round.
       environment: unbatched.
@@ -172,7 +172,7 @@ def update_from_buffer(
             buffer, keys.indices, time, (updates, size[0])
         )
         draws = jax.vmap(
-            lambda key, extras: sac.sample_noise(
+            lambda key, extras: sac.sample_update_noise(
                 key, learner.method_state, extras, size, method, settings
             )
         )(
@@ -188,9 +188,9 @@ def update_from_buffer(
 
         group = sac_updates.group_size(updates, settings)
         learner, metrics = sac_updates.updates(
-            learner, draws, batch, first, updates, method, settings, group
+            learner, draws, batch, before, updates, method, settings, group
         )
-        made = Round(first, first + updates, metrics)
+        made = Round(before, before + updates, metrics)
         if settings.redo_every:
             learner = plasticity.redo_in_time(
                 keys.redo, learner, fresh_batch, made, method, settings
@@ -222,7 +222,7 @@ def run_chunk(
     environment: Environment,
     method: Method,
     settings: SacSettings,
-    shape: LoopConfig,
+    config: LoopConfig,
 ) -> tuple[RunnerState, ChunkMetrics]:
     """Collects and updates for a chunk.
 
@@ -235,19 +235,19 @@ def run_chunk(
       environment: unbatched.
       method: the member's method.
       settings: SAC's settings.
-      shape: static sizes.
+      config: static sizes.
     """
     color, length = settings.noise_color, environment.episode_length
-    size = shape.envs, environment.action_size
+    size = config.envs, environment.action_size
 
     def update(key, state, done):
         return update_from_buffer(
             key,
             state,
             done,
-            shape.before(done),
-            shape.due(done),
-            updates=shape.updates,
+            config.before(done),
+            config.due(done),
+            updates=config.updates,
             environment=environment,
             method=method,
             settings=settings,
@@ -264,7 +264,7 @@ def run_chunk(
             )
         keys = random_keys.of_step(key, index)
         collection, stepped = collect(
-            keys.collect, state, task, index, environment, method, shape, sequence
+            keys.collect, state, task, index, environment, method, config, sequence
         )
         state = state._replace(collection=collection)
         state, metrics = update(keys.update, state, index + 1)
@@ -273,7 +273,7 @@ def run_chunk(
             report.episodes + jnp.sum(ended),
             report.returns + jnp.sum(jnp.where(ended, stepped.score, 0.0)),
             report.rewards + jnp.mean(stepped.reward),
-            report.updates + shape.due(index + 1),
+            report.updates + config.due(index + 1),
             jax.tree.map(jnp.add, report.metrics, metrics),
             {},
             jax.tree.map(

@@ -12,7 +12,7 @@ import pytest
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import seconds
 from rewire_jax.run.campaign import Crew, slots
-from rewire_jax.run.campaign_file import Run, read_campaign
+from rewire_jax.run.campaign_file import PlannedRun, read_campaign
 from rewire_jax.run.campaign_jobs import Job, last_line
 from rewire_jax.run.campaign_population import decide, grouped, submitted_runs
 from rewire_jax.run.campaign_status import status
@@ -76,7 +76,7 @@ def file(tmp_path) -> Path:
 
 
 @pytest.fixture
-def runs(file) -> tuple[Run, ...]:
+def runs(file) -> tuple[PlannedRun, ...]:
     return read_campaign(file).runs
 
 

@@ -33,7 +33,9 @@ def test_with_overlap_the_policy_before_the_last_updates_acts():
     def acted(learner, time):
         step_key = jax.random.split(jax.random.fold_in(key[1], time))[0]
         action, _ = exploration.explore(
-            exploration.sample_noise(step_key, jnp.asarray(time), (1, 2), 0, None),
+            exploration.sample_action_noise(
+                step_key, jnp.asarray(time), (1, 2), 0, None
+            ),
             jax.tree.map(lambda x: x[0], (learner.params, learner.method_state)),
             (),
             final.observation[0, time],

@@ -193,12 +193,12 @@ def test_success_in_a_chunk_is_that_of_the_episodes_which_ended():
 
 
 def test_updates_follow_every_so_many_steps():
-    shape = loop_state.LoopConfig(
+    config = loop_state.LoopConfig(
         1, updates=7, warmup=10, random_steps=0, transitions=9, update_every=4
     )
-    due = [steps for steps in range(1, 30) if shape.due(steps)]
+    due = [steps for steps in range(1, 30) if config.due(steps)]
     assert due == [12, 16, 20, 24, 28]
-    assert [shape.before(steps) for steps in due] == [0, 7, 14, 21, 28]
+    assert [config.before(steps) for steps in due] == [0, 7, 14, 21, 28]
     plan = planned(interactions=163)
     assert plan.budget.steps == 160  # a task ends with updates
 

@@ -268,7 +268,7 @@ def critic_gradient(critic=None, **penalty):
     learner = jax.jit(lambda key: sac.init(key, method, SPEC, settings))(KEY)
     first = learner.critic
     learner = learner._replace(critic=critic or first)
-    draw = sac.sample_noise(KEY, (), (), batch.action.shape, method, settings)
+    draw = sac.sample_update_noise(KEY, (), (), batch.action.shape, method, settings)
     metrics = sac.first_metrics(learner, batch, draw, method, settings)
     updated = jax.jit(sac.update, static_argnums=(5,))
     after, _ = updated(learner, metrics, batch, draw, 0, method, settings)

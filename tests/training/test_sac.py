@@ -55,7 +55,7 @@ def update(learner, metrics, batch, count, settings):
 
 def drawn(batch, settings):
     size = batch.action.shape
-    return sac.sample_noise(jax.random.key(1), (), (), size, METHOD, settings)
+    return sac.sample_update_noise(jax.random.key(1), (), (), size, METHOD, settings)
 
 
 @pytest.fixture(autouse=True)

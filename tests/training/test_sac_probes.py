@@ -57,7 +57,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
     )
     entry = find_method("ft1")
     method = entry.make(spec, entry.preset("", 1, "paper"))
-    shape = loop_state.LoopConfig(
+    config = loop_state.LoopConfig(
         envs=8, updates=4, warmup=12, random_steps=100, transitions=300
     )
     steps = 300
@@ -67,11 +67,11 @@ def test_probe_values_and_actions_are_learned(time_limit):
         def begin(task, key):
             learner = sac.init(key, method, spec, settings)
             episodes = jax.vmap(lambda key: rollout.begin(environment, task, key))(
-                jax.random.split(key, shape.envs)
+                jax.random.split(key, config.envs)
             )
             buffer = replay_buffer.create(
                 episodes.state.observation,
-                transitions=shape.transitions,
+                transitions=config.transitions,
                 actions=1,
                 episode_length=environment.episode_length,
             )
@@ -88,7 +88,7 @@ def test_probe_values_and_actions_are_learned(time_limit):
                 environment=environment,
                 method=method,
                 settings=settings,
-                shape=shape,
+                config=config,
             )[0]
 
         state = jax.vmap(begin)(tasks, keys)

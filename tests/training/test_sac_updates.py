@@ -40,9 +40,9 @@ def test_groups_make_the_same_operations():
         jax.random.key(0)
     )
     size = settings.batch_size, SPEC.actions
-    draws = jax.vmap(lambda key: sac.sample_noise(key, (), (), size, method, settings))(
-        jax.random.split(jax.random.key(1), UPDATES)
-    )
+    draws = jax.vmap(
+        lambda key: sac.sample_update_noise(key, (), (), size, method, settings)
+    )(jax.random.split(jax.random.key(1), UPDATES))
     numbers = jax.random.normal(jax.random.key(2), (UPDATES, size[0], 5))
     ended = jnp.zeros(numbers.shape[:2], bool)
     action, reward = jnp.tanh(numbers[..., 2:4]), numbers[..., 4]
