@@ -38,9 +38,10 @@ def make_domain(backend: str, reward: str, names: tuple[str, ...]) -> Domain:
       The domain.
 
     Raises:
-      UserError: no such backend or task, or the backend is not installed.
+      UserError: no such backend, reward or task, or the backend is not installed.
     """
     task_parameters.check_names("Meta-World backend", [backend], BACKENDS)
+    task_parameters.check_names("Meta-World reward", [reward], REWARDS)
     return _make_domain(backend, reward, tuple(names))
 
 

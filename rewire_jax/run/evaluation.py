@@ -143,8 +143,6 @@ def evaluate(
     check_optional("--stage", stage)
     check_whole("--episodes", episodes, 1, MOST_EPISODES)
     check_whole("--seed", seed)
-    check_whole("--trials", trials, 1, MOST_EPISODES)
-    check_optional("--trial-steps", trial_steps, 1)
     require(
         task_label in get_args(TaskLabel),
         f"--task-label must be given or none, not {task_label}",

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import check_whole
+from rewire_jax.core.settings import MOST_EPISODES
 from rewire_jax.methods.shared import map_own
 from rewire_jax.run import episode_parts, halving
 from rewire_jax.run.halving import Array
@@ -63,14 +64,12 @@ def choose(plan: Plan, policies: Any, finished: int, how: Trials) -> Choice:
       how: how to choose.
 
     Raises:
-      UserError: the trials are longer than an episode, or the memory is too small.
+      UserError: a number in `how` is out of range, or the memory is too small.
     """
     length = plan.scenario.environment.episode_length
     steps = length if how.steps is None else how.steps
-    require(
-        1 <= steps <= length,
-        f"--trial-steps must be 1 to {length}, the length of an episode, not {steps}",
-    )
+    check_whole("--trials", how.trials, 1, MOST_EPISODES)
+    check_whole("--trial-steps", steps, 1, length)
     short = _shortened(plan, steps)
     num_slots, tasks = plan.num_slots, len(plan.names)
     interactions = np.zeros((num_slots, tasks), int)

@@ -5,7 +5,7 @@ import pytest
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs import probe
 from rewire_jax.envs.base import TaskChange
-from rewire_jax.envs.domains import DOMAINS, register_domain
+from rewire_jax.envs.domains import DOMAINS, DomainKind, register_domain
 from rewire_jax.envs.scenarios import (
     SCENARIOS,
     ScenarioSpec,
@@ -178,8 +178,10 @@ def test_scenarios_of_a_domain_share_its_environment():
 
 
 def test_reach_has_four_goals_and_no_backend():
-    scenario = make_scenario("probe/reach", "mjx")
+    scenario = make_scenario("probe/reach")
     assert scenario.backend == "probe"
+    with pytest.raises(UserError, match="--backend"):
+        make_scenario("probe/reach", "mjx")
     goals = {tuple(task.data.physics.tolist()) for task in scenario.tasks}
     assert len(goals) == len(scenario.tasks) == scenario.distinct == 4
 
@@ -211,13 +213,15 @@ def test_own_scenarios(monkeypatch):
 
 
 def test_a_domain_of_ones_own(monkeypatch):
-    monkeypatch.setitem(DOMAINS, "mine", None)  # and forgotten again
     domain = probe.make_domain("match")
+    own_kind = DomainKind(lambda *_: domain, "own")
+    monkeypatch.setitem(DOMAINS, "mine", own_kind)  # and forgotten again
     register_domain("mine", domain)
-    scenario = make_scenario(own(domain="mine"), backend="spring")
+    scenario = make_scenario(own(domain="mine"))
     assert scenario.environment is domain.environment
-    # It is not on a backend that it has never heard of.
     assert scenario.backend == "own"
+    with pytest.raises(UserError, match="--backend"):
+        make_scenario(own(domain="mine"), backend="spring")
 
 
 @pytest.mark.parametrize(

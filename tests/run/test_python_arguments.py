@@ -29,8 +29,6 @@ WRONG: list[tuple[str, Callable[[Any], Any]]] = [
     ("--stage", lambda x: rewire_jax.evaluate(HERE, stage=x)),
     ("--episodes", lambda x: rewire_jax.evaluate(HERE, episodes=x)),
     ("--seed", lambda x: rewire_jax.evaluate(HERE, seed=x)),
-    ("--trials", lambda x: rewire_jax.evaluate(HERE, trials=x)),
-    ("--trial-steps", lambda x: rewire_jax.evaluate(HERE, trial_steps=x)),
     ("--episode", lambda x: rewire_jax.render(HERE, task=0, episode=x)),
     ("--workers", lambda x: rewire_jax.campaign(HERE, workers=x)),
     ("--halving", lambda x: rewire_jax.sweep(small(), HERE, halving=x)),

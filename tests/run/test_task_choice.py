@@ -152,6 +152,8 @@ def test_simulators_on_the_host_are_chosen_for_alike(monkeypatch) -> None:
         (Trials(2**21, None, 0), "--trials"),
         (Trials(1, 0, 0), "--trial-steps"),
         (Trials(1, 21, 0), "--trial-steps"),
+        (Trials(1.5, None, 0), "--trials"),  # type: ignore[arg-type]
+        (Trials(1, True, 0), "--trial-steps"),
     ],
 )
 def test_bad_trials(trials: Trials, flag: str) -> None:
