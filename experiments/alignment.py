@@ -40,11 +40,12 @@ MEASURES = {
 }
 
 NOTES = (
-    "After so many updates. Weights: squared distance of the weights to the previous "
-    "ones as the adapters order them, relative to their square. Orders: share of the "
-    "places in the adapters' orders that changed in the last 100. Actions: squared "
-    "change of an old policy's outputs by its refined wiring on the new weights, "
-    "relative to their variance over observations.",
+    "The columns are numbers of updates. Weights: squared distance between the new "
+    "weights and the previous weights in the adapters' order, divided by the squared "
+    "norm of the previous weights. Orders: share of positions in the adapters' orders "
+    "that changed in the last 100 updates. Actions: an old policy acts with its "
+    "refined wiring and the new weights; the squared change of its outputs, divided "
+    "by their variance over observations.",
 )
 
 

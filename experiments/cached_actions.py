@@ -26,10 +26,11 @@ from rewire_jax.run.policies import Policies
 from rewire_jax.training.acting import Act
 
 NOTES = (
-    "Squared change of a policy's actions in the states that it visits in its own task "
-    "right after its training, relative to their variance. 0: it acts as before. 2: as "
-    "another policy with actions of the same mean and variance. Median, and lowest to "
-    "highest, over tasks and seeds.",
+    "Right after the training of a task, its policy visits some states. The table "
+    "shows how its actions in these states change later: their squared change, "
+    "divided by their variance. 0: the policy acts as before. 2: it acts like an "
+    "unrelated policy whose actions have the same mean and variance. A cell is the "
+    "median (lowest to highest) over tasks and seeds.",
 )
 
 

@@ -65,9 +65,10 @@ def tell(curve: Curve) -> str:
     return (
         f"- {curve.label}: diverge-and-converge "
         f"**{'appears' if median.converges else 'does not appear'}** in the median "
-        f"over seeds, and appears in {sum(seeds)} of {len(seeds)} seeds. The median is "
-        f"highest around {median.at:,.0f} interactions, {number(median.peak)}, and "
-        f"{number(median.end)} at the end, {median.share:.0%} of that."
+        f"over seeds, and appears in {sum(seeds)} of {len(seeds)} seeds. The median "
+        "over seeds, smoothed over a tenth of the reports, peaks at "
+        f"{number(median.peak)} near {median.at:,.0f} interactions. It ends at "
+        f"{number(median.end)}, {median.share:.0%} of the peak."
     )
 
 
@@ -76,8 +77,9 @@ def run(job: FirstTask) -> None:
     variants = {name: VARIANTS[name] for name in LABELS}
     evolved = first_task.train(job, "Figure 3", variants, LABELS, "mode_divergence")
     notes = (
-        "Diverge-and-converge is said to appear where the divergence ends below half "
-        "of its peak, both being medians over a tenth of the progress reports.",
+        "We say that diverge-and-converge appears if the divergence at the end is "
+        "below half of its peak. Both values are medians over a tenth of the progress "
+        "reports.",
         "",
         *(tell(trained.curve) for trained in evolved.found.values()),
         "",

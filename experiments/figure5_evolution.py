@@ -139,8 +139,9 @@ def notes(found: dict[str, Trained]) -> Sequence[str]:
     return (
         *by_seed(found),
         *by_pair(found),
-        "In parentheses: 95% bootstrap interval over seeds. A run's environments start "
-        "their episodes together, and from rest: the dips.",
+        "In parentheses: 95% bootstrap interval over seeds. All environments of a run "
+        "start their episodes at the same time, at rest. This causes the dips in the "
+        "curves.",
         "",
     )
 

@@ -155,8 +155,10 @@ def run(job: HostLoop) -> None:
     title = f"{job.scenario}, paper profile: milliseconds for 50 steps and 50 updates"
     notes = [
         f"Medians of {job.rounds} rounds; simulators and updates were timed alone. "
-        "With overlap, the next steps are made while updates go on, by the policy "
-        "before these."
+        "With overlap, the next steps run during the updates, with the policy from "
+        "before these updates. The ratios are medians of the ratios in each round: the "
+        "loop over simulators and updates together, and the loop with overlap over the "
+        "larger of the two."
     ]
     suite.write(job.out, title, suite.table(rows, COLUMNS), notes, rows)
 

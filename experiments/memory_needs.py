@@ -21,7 +21,8 @@ READING = (
     "Counted for the paper profile before anything is compiled: the learner, the "
     "replay buffer, the environments, temporary arrays of training (work), and "
     "temporary arrays of an evaluation. The total is the learner and the larger of "
-    "training and evaluation. Environments that are stepped on the host take no memory "
+    "two sums: buffer, environments and work, or the evaluation. Environments that "
+    "are stepped on the host take no memory "
     "of the device."
 )
 COLUMNS = {

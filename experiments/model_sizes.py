@@ -34,8 +34,9 @@ FORMULAS = {
     "orders; adapters",
 }
 SYMBOLS = (
-    "Computed with the paper profile by each method's own count; means over a domain's "
-    "scenarios. T is the length of the sequence: 8, on Humanoid 4. L = 3 hidden layers "
+    "Each method counts its own numbers, with the paper profile. A cell is the mean "
+    "over the scenarios of a domain. T is the length of the sequence: 8, on Humanoid "
+    "4. L = 3 hidden layers "
     "of n = 256 neurons, observations of length o, actions of length a. A plain policy "
     "of width w has P(w) = (o + 1) w + (L − 1) (w + 1) w + 2a (w + 1) numbers, P is "
     "P(n), and its head has H = 2a (n + 1) of them. K = 3 wirings and S = 4 head "
@@ -45,8 +46,9 @@ SYMBOLS = (
 DIFFERENCES = (
     "Where the paper has another number:",
     "",
-    "- PNN: the paper's is T. The published width is 96, with which the inner layers "
-    "of the laterals, that grow with T², bring 8 tasks close to T, but not 4.",
+    "- PNN: the paper's is T. The published width is 96. The inner layers of the "
+    "lateral connections grow with T². So the size is close to T for 8 tasks, but not "
+    "for 4.",
     "- CSP: the number of anchors depends on the run; the paper's are means over runs.",
 )
 

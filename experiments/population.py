@@ -26,13 +26,15 @@ from rewire_jax.training import memory_estimate
 from rewire_jax.training.run_setup import prepare
 
 READING = (
-    "A population is members side by side in one compiled function. Times are of "
+    "A population is a set of members that one compiled function trains together. "
+    "Times are of "
     "training, environments and updates, in the best round; processor time is that of "
-    "all threads. Planned is what the compiler plans for a chunk of training, "
-    "arguments and temporary arrays; estimated is what "
+    "all threads. Planned is what the compiler plans for a chunk of training (its "
+    "arguments and temporary arrays); estimated is what "
     "`rewire_jax.training.memory_estimate` counts for "
-    "the same before anything is compiled. The peak is the process's, with all that "
-    "compiling takes, or the device's where it has memory of its own. Compile time is "
+    "the same before anything is compiled. On a device with its own memory, the peak "
+    "is the device's. Otherwise it is the process's, with the memory for compiling. "
+    "Compile time is "
     "that of a chunk, traced and without a cache of earlier compilations."
 )
 

@@ -46,9 +46,9 @@ COLUMNS: suite.Columns = {
     "seeds": suite.show("seeds"),
 }
 READING = (
-    "Of the policies of all tasks, the one with the best return in trials is chosen by "
-    "successive halving. Trials: those of each remaining policy in a round. The steps "
-    "of a trial are counted from a reset. Both returns are means over tasks and seeds. "
+    "Successive halving chooses the policy with the best return in trials. Trials: "
+    "how often each remaining policy plays in a round. A trial starts with a reset. "
+    "Both returns are means over tasks and seeds. "
     "The interactions are those of the trials."
 )
 

@@ -112,9 +112,10 @@ def draw(axes: Axes, rows: list[Row]) -> None:
 
 PART = Part(
     title="Environment steps a second",
-    reading="Random actions, no policy. Brax's environments are compiled, Meta-World's "
-    "are simulators on the host, a process each where there are two. The gain is in "
-    "steps a second over a single environment.",
+    reading="Random actions, no policy. Brax's environments are compiled. "
+    "Meta-World's are simulators on the host; if there are two, each has its own "
+    "process. The gain is in steps a second over a single environment, the median of "
+    "the ratios in each round.",
     measure=measure,
     columns={
         "environment": show("environment"),

@@ -184,19 +184,21 @@ def _ratio(what: str, policy: str) -> Callable[[Row], str]:
 PART = Part(
     title="Whole loops, and peers",
     reading="HalfCheetah on brax.v1, 128 environments, 64 updates after each of their "
-    "steps, networks of 3 × 256, batches of 256. The last four columns say how often "
-    "ours repeats while the other does once, with a policy update as often; in bold "
-    "where the other is ahead. SBX's and PyTorch's learners are in the host's hands "
-    "and step the same compiled environments by a call each; rejax is compiled as a "
-    "whole. rejax has no delayed policy updates. PyTorch's is written for this, "
-    "`rewire` with straight-through SoftSort matrices. `make setup-bench` installs the "
+    "steps, networks of 3 × 256, batches of 256. The updates a second are measured "
+    "alone, without environments. The last four columns are our speed divided by that "
+    "of the other implementation, with the same delay of the policy: medians of the "
+    "ratios in each round. In bold, the other one is faster. SBX and PyTorch learn on "
+    "the host and call the same compiled environments once for each step; rejax "
+    "compiles the whole loop, and has no delayed policy updates. We wrote the PyTorch "
+    "version for this comparison; its `rewire` uses straight-through SoftSort "
+    "matrices. `make setup-bench` installs the "
     "peers.",
     measure=measure,
     columns={
         "implementation": show("name"),
         "version": lambda row: row.get("version") or "not installed",
         "policy": show("policy"),
-        "updates to one of the policy": show("delay"),
+        "critic updates for each policy update": show("delay"),
         "interactions a second": show("interactions_per_second", ",.0f"),
         "updates a second": show("updates_per_second", ",.0f"),
         "our plain loop": _ratio("whole", "plain"),
@@ -204,5 +206,8 @@ PART = Part(
         "our plain updates": _ratio("alone", "plain"),
         "our rewire updates": _ratio("alone", "rewire"),
     },
-    picture=("Whole loops: implementation, policy, updates to one of the policy", draw),
+    picture=(
+        "Whole loops: implementation, policy, critic updates for each policy update",
+        draw,
+    ),
 )

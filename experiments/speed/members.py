@@ -39,10 +39,10 @@ def draw(axes: Axes, rows: list[Row]) -> None:
 
 PART = Part(
     title="Members side by side",
-    reading="Rewire updates of all members together, as training makes them on a "
-    "probe, whose own steps cost next to nothing; the quick profile's width of 128. "
-    "Each number of members is measured in a process of its own, so the gains are not "
-    "of the same rounds. `experiments.population` measures the same on HalfCheetah, "
+    reading="Rewire updates of all members together, in training on a probe (a small "
+    "test environment whose steps cost almost nothing). Width 128, as in the quick "
+    "profile. Each number of members has its own process, so the gains do not compare "
+    "the same rounds. `experiments.population` measures the same on HalfCheetah, "
     "and memory.",
     measure=measure,
     columns={

@@ -132,9 +132,10 @@ def _megabytes(name: str) -> Callable[[Row], str]:
 
 PART = Part(
     title="The permutation, forward and backward",
-    reading="`permute` beside the straight-through form with n × n matrices, each as "
-    "XLA compiles it: the value, and the gradients in a layer's output and in the "
-    "scores. Memory is that of temporary arrays, as compiled.",
+    reading="`permute` is compared with the straight-through form that uses n × n "
+    "matrices. XLA compiles both. A measurement computes the value and the gradients "
+    "of a layer's output and of the scores. Memory is that of temporary arrays, as "
+    "compiled.",
     measure=measure,
     columns={
         "n": show("hidden"),

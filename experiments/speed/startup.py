@@ -69,10 +69,10 @@ def measure(effort: Effort) -> list[Row]:
 
 PART = Part(
     title="From the start to the first updates",
-    reading="`rewire-jax train` with rewire and the quick profile, in a process of its "
-    "own, from its start to the first progress report after updates: with an empty "
-    "folder of compilations, and with the one that this left. An evaluation and a "
-    "selection of one episode each come before.",
+    reading="The time from the start of `rewire-jax train` to the first progress "
+    "report after updates, with rewire and the quick profile: first with an empty "
+    "compilation cache, then with the cache that the first run filled. It includes one evaluation "
+    "episode and one selection episode.",
     measure=measure,
     columns={
         "scenario": show("scenario"),

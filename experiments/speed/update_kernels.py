@@ -34,11 +34,12 @@ def measure(effort: Effort) -> list[Row]:
 
 PART = Part(
     title="Kernels of one update",
-    reading="Counted in the compiled program on this device: what is launched in the "
-    "loop over updates, over its updates. Of a branch all kernels count, although only "
-    "each second update makes them; in groups that is known when they are compiled, so "
-    "they are in each second update alone. On a GPU, a branch also waits for the host, "
-    "so a GPU makes updates in groups, and a CPU with a branch in each.",
+    reading="Kernels that the loop over updates launches, divided by the number of "
+    "updates, counted in the compiled program on this device. All kernels of a branch "
+    "count, although only every second update runs them. In groups, the compiler "
+    "knows which updates train the policy, so only these contain its kernels. On a "
+    "GPU, a branch also waits for the host. So a GPU makes updates in groups, and a "
+    "CPU with a branch in each update.",
     measure=measure,
     columns={
         "policy": show("policy"),

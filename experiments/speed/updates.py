@@ -148,11 +148,11 @@ def _flops(row: Row) -> str:
 
 PART = Part(
     title="Updates a second, against matrix products",
-    reading="`square` is a product of 256 × 256 matrices, `shapes` are all the "
-    "products of a plain update in their own shapes; `plain/2` and `rewire/2` are "
-    "updates with the policy at every second one, `plain/1` and `rewire/1` at each; "
-    "`matching` is rewire with `--alignment matching`. "
-    "The share is that of the rate of `square`, the cost in plain updates.",
+    reading="`square` is one product of 256 × 256 matrices. `shapes` are all matrix "
+    "products of a plain update, alone. `/2`: every second update also updates the "
+    "policy; `/1`: every update does. `matching` is rewire with `--alignment "
+    "matching`. Share: GFLOP/s divided by that of `square`. Cost: the time of an "
+    "update divided by that of a plain update, the median over rounds.",
     measure=measure,
     columns={
         "loop": lambda row: f"`{row['loop']}`",

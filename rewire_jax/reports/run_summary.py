@@ -30,7 +30,7 @@ _SHARED = {
 }
 # The measures of a task, in a table's order, with their headings.
 MEASURES = {
-    "before": "before training",
+    "before": "before the first task",
     "after": "right after own training",
     "end": "at the end",
     "forgetting": "forgetting",

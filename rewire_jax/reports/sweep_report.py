@@ -115,14 +115,14 @@ def _details(summary: SweepSummary) -> Iterator[str]:
 
 def _reading(summary: SweepSummary) -> str:
     """How to read the picture."""
-    text = "Mean over seeds"
+    text = "Points: mean over seeds."
     if any(each.performance.std is not None for each in summary.configurations):
-        text += ", bars: standard deviation"
-    text += "; orange: the best"
+        text += " Bars: standard deviation."
+    text += " Orange: the best."
     if any(each.stage < summary.stage for each in summary.configurations):
-        text += "; hollow: after fewer tasks"
+        text += " Hollow: after fewer tasks."
     if summary.sweep.random or len(summary.panels) < 2:
-        return f"{text}."
+        return text
     # A panel names the values of all axes but its own.
     centre = {
         panel.axis: summary.panels[place - 1].others[panel.axis]
@@ -130,7 +130,8 @@ def _reading(summary: SweepSummary) -> str:
     }
     best = summary.best is not None and summary.best.values == centre
     where = "at their best" if best else "where the lines of the sweep cross"
-    return f"{text}; the other axes {where}: {settings_text(centre)}."
+    others = f"the others are {where}: {settings_text(centre)}."
+    return f"{text} Each panel varies one setting; {others}"
 
 
 def _draw(summary: SweepSummary, title: str, folder: Path) -> None:

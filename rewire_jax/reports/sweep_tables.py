@@ -43,7 +43,7 @@ def ranking(summary: SweepSummary) -> Table:
         *summary.sweep.axes,
         f"performance ({UNIT})",
         "mean [95% interval]",
-        "of the choosing episodes",
+        "performance in the ranking episodes",
         "seeds",
         "tasks",
     )

@@ -105,7 +105,7 @@ def test_panels_vary_one_axis_from_the_best(tmp_path):
         expected = sorted({values[axis] for values in GRID})
         assert [each.values for each in line] == [best | {axis: x} for x in expected]
     text = report.page.read_text()
-    assert "the other axes at their best: modes 3, alpha 1e-5, beta 1." in text
+    assert "the others are at their best: modes 3, alpha 1e-5, beta 1." in text
     # By K = 3: over all its configurations, the best of them, along the panel.
     everything = [mean(score, c, 0, 2) + 5 for c in GRID if c["modes"] == 3]
     std = statistics.stdev(everything)
@@ -194,7 +194,7 @@ def test_halved_away_rank_by_how_far_they_came(tmp_path):
     assert stages == [3] * 2 + [2] * 4 + [1] * 6
     text = report.page.read_text()
     assert "10 configurations were halved away before the end" in text
-    assert "hollow: after fewer tasks" in text
+    assert "Hollow: after fewer tasks" in text
     # Only what came to the end is averaged by value.
     assert "| 1 | 2 of 4 |" in text
     assert "| 3 | 0 of 4 | – | – | – |" in text
