@@ -71,8 +71,8 @@ PART = Part(
     title="From the start to the first updates",
     reading="The time from the start of `rewire-jax train` to the first progress "
     "report after updates, with rewire and the quick profile: first with an empty "
-    "compilation cache, then with the cache that the first run filled. It includes one evaluation "
-    "episode and one selection episode.",
+    "compilation cache, then with the cache that the first run filled. It includes "
+    "one evaluation episode and one selection episode.",
     measure=measure,
     columns={
         "scenario": show("scenario"),
