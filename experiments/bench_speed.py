@@ -83,7 +83,8 @@ def report(results: Mapping[str, Any], folder: Path) -> str:
             figure.savefig(folder / f"{name}.png")
             lines += [f"![{title}]({name}.png)", ""]
         lines += [result["reading"], ""]
-        took = f"in {result['seconds']:.0f} s, load {load[0]:.1f} to {load[1]:.1f}"
+        busy = f"load average {load[0]:.1f} before and {load[1]:.1f} after"
+        took = f"in {result['seconds']:.0f} s, {busy}"
         lines += [f"Measured {took}, on {how_made(how)}."]
     return "\n".join(lines) + "\n"
 

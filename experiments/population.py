@@ -208,7 +208,7 @@ def run(job: Population) -> None:
         READING,
         "",
         f"{job.method} on {job.scenario}, {job.profile} profile; {cores} cores for "
-        f"this, load {before:.1f} to {after:.1f}; best of "
+        f"this, load average {before:.1f} before and {after:.1f} after; best of "
         f"{job.rounds} rounds of {job.steps} steps.",
     )
     suite.write(out, "Members side by side", suite.table(rows, COLUMNS), notes, rows)

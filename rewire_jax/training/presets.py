@@ -121,7 +121,7 @@ def _quick(base: Settings, tasks: int) -> Settings:
     """A profile of minutes on two cores.
 
     Its settings of SAC were chosen on the first task of halfcheetah/forgetting, with
-    FT-1: docs/results.md, "Short regimes".
+    FT-1: docs/results.md, "Short training settings".
     """
     interactions = min(96_000, base.interactions)
     return dataclasses.replace(
