@@ -139,7 +139,8 @@ def run(job: Regimes) -> None:
         ]
     require(bool(numbers), "none of the runs has ended")
     backend = job.scenario_of(SCENARIO).backend
-    title = f"Short training settings: FT-1 on the first task of {SCENARIO}, {backend} backend"
+    place = f"the first task of {SCENARIO}, {backend} backend"
+    title = f"Short training settings: FT-1 on {place}"
     path = job.folder("quick-regime") / "quick-regime"
     suite.write(path, title, rows, ["", READING, "", *origins], numbers)
 
