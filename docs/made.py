@@ -22,7 +22,8 @@ from experiments import suite
 from rewire_jax.cli import main
 from rewire_jax.cli.commands import COMMANDS
 from rewire_jax.cli.flags import Flags
-from rewire_jax.core.settings import SacSettings, Settings, flag, traced_fields
+from rewire_jax.core.arguments import flag
+from rewire_jax.core.settings import SacSettings, Settings, traced_fields
 from rewire_jax.methods import METHODS
 from rewire_jax.reports.table import to_markdown
 

@@ -36,8 +36,9 @@ from experiments.speed.part import Effort, on_probe
 from experiments.speed.timing import Loop, in_turn, repetitions
 from experiments.speed.updates import METHODS, update_loop, updates
 from experiments.suite import Row
+from rewire_jax.core.arguments import require
 from rewire_jax.core.formatting import seconds as seconds_of
-from rewire_jax.core.settings import Settings, require
+from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import Environment
 from rewire_jax.storage import run_folder
 from rewire_jax.training.run_setup import prepare

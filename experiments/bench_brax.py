@@ -11,7 +11,7 @@ from pathlib import Path
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports.paper_results import NAMES
 from rewire_jax.reports.report import to_terminal
 

@@ -26,7 +26,7 @@ from experiments.speed import (
     updates,
 )
 from experiments.speed.part import Effort, Part
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports import plots
 from rewire_jax.reports.provenance import how_made
 from rewire_jax.reports.table import to_markdown

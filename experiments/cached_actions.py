@@ -17,8 +17,8 @@ import jax.numpy as jnp
 
 import rewire_jax
 from experiments import suite
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment
 from rewire_jax.reports import plots
 from rewire_jax.reports.campaign_data import read_campaign_data

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports.campaign_data import read_campaign_data
 from rewire_jax.reports.campaign_section import IMPROVEMENT, Section
 from rewire_jax.reports.table import to_markdown

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import suite
+from rewire_jax.core.arguments import require
 from rewire_jax.core.formatting import number
-from rewire_jax.core.settings import require
 from rewire_jax.reports.plots import Array
 from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.titles import heading

@@ -17,7 +17,7 @@ import numpy as np
 import rewire_jax
 from experiments import suite
 from experiments.speed.timing import timed
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.envs.vector_env import VectorEnv
 from rewire_jax.training.run_setup import Plan, prepare

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import averages, suite
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports import paper_results
 from rewire_jax.storage.scores import Success
 

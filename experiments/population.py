@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 import rewire_jax
 from experiments import suite
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports import plots
 from rewire_jax.training import memory_estimate
 from rewire_jax.training.run_setup import prepare

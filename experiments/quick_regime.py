@@ -11,8 +11,8 @@ from typing import Any
 
 from experiments import first_task, suite
 from experiments.first_task import Trained
+from rewire_jax.core.arguments import require
 from rewire_jax.core.formatting import number
-from rewire_jax.core.settings import require
 from rewire_jax.reports.provenance import origin
 from rewire_jax.storage.run_results import RunData, read_run
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, TypeVar
 import tyro
 
 import rewire_jax
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import require
 from rewire_jax.reports.data_files import csv_text, json_text
 from rewire_jax.reports.provenance import how_made
 from rewire_jax.reports.report import Report

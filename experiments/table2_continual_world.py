@@ -7,7 +7,7 @@ Both use Meta-World v3; the paper used v1.
 from dataclasses import dataclass
 
 from experiments import averages, paper_table, suite
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports import paper_results
 from rewire_jax.storage.scores import SUCCESS, Success
 

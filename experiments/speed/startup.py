@@ -8,7 +8,7 @@ from pathlib import Path
 
 from experiments.speed.part import Effort, Part
 from experiments.suite import Row, show
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 
 SETTINGS = {
     "profile": "quick",

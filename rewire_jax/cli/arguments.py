@@ -14,8 +14,8 @@ from rich.text import Text
 
 from rewire_jax.cli.commands import COMMANDS, Command, Sweep, Train
 from rewire_jax.cli.flags import Flags
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import require
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.training.presets import preset
 

@@ -14,7 +14,8 @@ import tyro
 from rewire_jax.cli.campaign_command import Campaign
 from rewire_jax.cli.evaluate_command import Evaluate
 from rewire_jax.cli.flags import Flags
-from rewire_jax.core.settings import Settings, require
+from rewire_jax.core.arguments import require
+from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import Scenario, list_scenarios, make_scenario
 from rewire_jax.methods import METHODS
 from rewire_jax.rendering import render

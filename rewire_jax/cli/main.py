@@ -15,10 +15,10 @@ from collections.abc import Iterator, Sequence
 from rich.console import Console
 
 from rewire_jax.cli import arguments
+from rewire_jax.core.arguments import require
 from rewire_jax.core.compilation_cache import keep_compiled
 from rewire_jax.core.errors import UserError, remedy
 from rewire_jax.core.machine_memory import address_limit
-from rewire_jax.core.settings import require
 from rewire_jax.run import interrupts
 from rewire_jax.version import __version__
 

@@ -1,4 +1,4 @@
-"""Checks of arguments that callers from Python give."""
+"""Checks of arguments and of settings' values."""
 
 import math
 import numbers
@@ -7,6 +7,32 @@ from typing import Any
 from rewire_jax.core.errors import UserError
 
 MOST = 2**31 - 1  # Counters have 32 bits.
+
+
+def require(condition: bool, message: str) -> None:
+    """Raises `UserError(message)` unless the condition holds."""
+    if not condition:
+        raise UserError(message)
+
+
+def flag(name: str) -> str:
+    """The command-line flag of a setting."""
+    return "--" + name.replace("_", "-")
+
+
+def require_counts(group: Any, *names: str) -> None:
+    """Raises `UserError` unless each of these values of a dataclass is at least 1."""
+    for name in names:
+        value = getattr(group, name)
+        require(value >= 1, f"{flag(name)} must be at least 1, not {value}")
+
+
+def require_weights(group: Any, *names: str) -> None:
+    """Raises `UserError` unless each of these values is at least 0 and finite."""
+    for name in names:
+        value = getattr(group, name)
+        fits = 0 <= value < math.inf
+        require(fits, f"{flag(name)} must be at least 0 and finite, not {value}")
 
 
 def check_whole(name: str, value: Any, least: int = 0, most: int = MOST) -> None:
@@ -40,5 +66,10 @@ def check_seconds(name: str, value: Any) -> None:
 
 def check_name(kind: str, value: Any) -> None:
     """Raises `UserError` unless a value can name something of this kind."""
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+    if (
+        not isinstance(value, str)
+        or value != value.strip()
+        or not value.isprintable()
+        or not value
+    ):
         raise UserError(f"a {kind}'s name must be printable text, not {value!r:.80}")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import jax
 import tyro
 
-from rewire_jax.core.errors import UserError
+from rewire_jax.core.arguments import flag, require
 
 T = TypeVar("T")
 
@@ -246,32 +246,6 @@ _KINDS: dict[Any, tuple[type, str]] = {
 }
 
 
-def require(condition: bool, message: str) -> None:
-    """Raises `UserError(message)` unless the condition holds."""
-    if not condition:
-        raise UserError(message)
-
-
-def flag(name: str) -> str:
-    """The command-line flag of a setting."""
-    return "--" + name.replace("_", "-")
-
-
-def require_counts(group: Any, *names: str) -> None:
-    """Raises `UserError` unless each of these values of a dataclass is at least 1."""
-    for name in names:
-        value = getattr(group, name)
-        require(value >= 1, f"{flag(name)} must be at least 1, not {value}")
-
-
-def require_weights(group: Any, *names: str) -> None:
-    """Raises `UserError` unless each of these values is at least 0 and finite."""
-    for name in names:
-        value = getattr(group, name)
-        fits = 0 <= value < math.inf
-        require(fits, f"{flag(name)} must be at least 0 and finite, not {value}")
-
-
 def check_kinds(group: Any) -> None:
     """Raises `UserError` if a value of a dataclass has the wrong type."""
     for name, kind in typing.get_type_hints(type(group)).items():
@@ -291,6 +265,25 @@ def check_kinds(group: Any) -> None:
                 require(value <= most, f"{flag(name)} must be at most {most}, {told}")
             if kind is float:
                 _check_float(flag(name), value)
+
+
+def typed(group: T) -> T:
+    """A dataclass whose values have their fields' types, as JSON would give them.
+
+    A whole number for a float, or a number of NumPy, has another text, so what was
+    saved with it would look like that of other settings.
+    """
+    values = {}
+    for name, kind in typing.get_type_hints(type(group)).items():
+        if kind in (bool, int, float):
+            values[name] = kind(getattr(group, name))
+    return dataclasses.replace(group, **values)  # type: ignore[type-var]
+
+
+def typed_settings(run: Settings) -> Settings:
+    """The same for settings that are valid, with those of SAC and of the method."""
+    parts = {"sac": typed(run.sac), "options": typed(run.options)}
+    return dataclasses.replace(typed(run), **parts)
 
 
 def _check_float(name: str, value: float) -> None:

@@ -5,8 +5,9 @@ import hashlib
 import json
 from typing import Any, TypeVar
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import SacSettings, Settings, require, validate
+from rewire_jax.core.settings import SacSettings, Settings, typed_settings, validate
 
 T = TypeVar("T")
 
@@ -51,7 +52,7 @@ def from_json(data: dict[str, Any], options: type) -> Settings:
     except (TypeError, KeyError, AttributeError) as error:
         raise UserError(f"its settings are damaged ({error})") from error
     validate(run)
-    return run
+    return typed_settings(run)
 
 
 def _filled(cls: type[T], data: dict[str, Any]) -> T:

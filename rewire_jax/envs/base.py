@@ -1,6 +1,7 @@
 """The interface of every environment: pure functions over pytrees."""
 
 import math
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -144,13 +145,17 @@ class TaskChange:
 
     def __post_init__(self) -> None:
         check_name("task", self.name)
+        for name in ("bodies", "actions", "extra"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise UserError(f"{name} of task {self.name!r} must be a dictionary")
         given = {n: getattr(self, n) for n in ("gravity", "friction", "hidden")}
-        for name, value in {**given, **self.bodies, **self.actions}.items():
-            try:
-                finite = math.isfinite(value)
-            except TypeError:
-                finite = False
-            if not finite:
+        for name, value in (
+            *given.items(),
+            *self.bodies.items(),
+            *self.actions.items(),
+        ):
+            real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+            if not real or not abs(value) < math.inf:
                 raise UserError(
                     f"{name} of task {self.name!r} must be a finite number, not {value}"
                 )

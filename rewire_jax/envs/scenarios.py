@@ -1,6 +1,7 @@
 """Sequences of tasks, as data: the paper's scenarios and one probe."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -42,6 +43,13 @@ class ScenarioSpec:
         check_name("scenario", self.name)
         for name in ("repeats", "interactions"):
             check_whole(f"{name} of scenario {self.name!r}", getattr(self, name), 1)
+        if not isinstance(self.changes, tuple) or not all(
+            isinstance(change, TaskChange) for change in self.changes
+        ):
+            raise UserError(f"Scenario {self.name!r} needs a tuple of TaskChange.")
+        for name in ("domain", "preset"):
+            if not isinstance(getattr(self, name), str):
+                raise UserError(f"{name} of scenario {self.name!r} must be a name.")
         if self.domain not in DOMAINS:
             raise UserError(unknown("domain", self.domain, list(DOMAINS)))
         if not self.changes:
@@ -127,6 +135,7 @@ def make_scenario(
         if spec not in SCENARIOS:
             raise UserError(unknown("scenario", spec, list(SCENARIOS)))
         spec = SCENARIOS[spec]
+    _check_spec(spec)
     check_names("reward", [reward], REWARDS)
     kind = DOMAINS[spec.domain]
     if backend is None:
@@ -160,9 +169,15 @@ def register_scenario(spec: ScenarioSpec) -> None:
     Raises:
       UserError: another scenario has this name.
     """
+    _check_spec(spec)
     if SCENARIOS.get(spec.name, spec) != spec:
         raise UserError(f"There is another scenario named {spec.name!r}.")
     SCENARIOS[spec.name] = spec
+
+
+def _check_spec(spec: Any) -> None:
+    if not isinstance(spec, ScenarioSpec):
+        raise UserError(f"a scenario must be a ScenarioSpec, not {spec!r:.80}")
 
 
 def list_scenarios() -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """The methods, and what one of your own is made of."""
 
+from rewire_jax.core.arguments import flag, require
 from rewire_jax.core.pytrees import at, count, put, tile
-from rewire_jax.core.settings import flag, require, settings, static, traced
+from rewire_jax.core.settings import settings, static, traced
 from rewire_jax.methods import cloning
 from rewire_jax.methods.base import Candidates, Method, Selection, Tools
 from rewire_jax.methods.finetune import FinetuneSettings, ft1, ft_n, sac_n

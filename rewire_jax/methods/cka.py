@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from rewire_jax.core.arguments import require_counts
 from rewire_jax.core.pytrees import count, learned_place
-from rewire_jax.core.settings import require_counts, settings
+from rewire_jax.core.settings import settings
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks

@@ -9,13 +9,9 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from rewire_jax.core.arguments import require, require_counts, require_weights
 from rewire_jax.core.pytrees import at, count, learned_place
-from rewire_jax.core.settings import (
-    require,
-    require_counts,
-    require_weights,
-    settings,
-)
+from rewire_jax.core.settings import settings
 from rewire_jax.methods import cloning
 from rewire_jax.methods.base import Candidates, Method
 from rewire_jax.methods.spec import Spec

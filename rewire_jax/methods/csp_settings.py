@@ -4,7 +4,8 @@ import dataclasses
 import math
 from typing import Literal
 
-from rewire_jax.core.settings import flag, require, settings, traced
+from rewire_jax.core.arguments import flag, require
+from rewire_jax.core.settings import settings, traced
 from rewire_jax.methods.base import CandidateScore
 
 

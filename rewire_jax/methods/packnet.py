@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.pytrees import count
-from rewire_jax.core.settings import require, settings, static
+from rewire_jax.core.settings import settings, static
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.finetune import FinetuneSettings, ft1
 from rewire_jax.methods.spec import Spec

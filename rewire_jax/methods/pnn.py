@@ -20,8 +20,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.arguments import require_counts
 from rewire_jax.core.pytrees import at, count, learned_place, put, tile
-from rewire_jax.core.settings import require_counts, settings
+from rewire_jax.core.settings import settings
 from rewire_jax.methods.base import Act, Method
 from rewire_jax.methods.shared import Shared
 from rewire_jax.methods.spec import Spec

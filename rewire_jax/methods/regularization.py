@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.arguments import require_counts, require_weights
 from rewire_jax.core.pytrees import count
-from rewire_jax.core.settings import require_counts, require_weights, settings
+from rewire_jax.core.settings import settings
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.finetune import FinetuneSettings, ft1
 from rewire_jax.methods.spec import Spec

@@ -9,8 +9,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.pytrees import at, count, put, tile
-from rewire_jax.core.settings import require
 from rewire_jax.methods import rewire_alignment, wiring
 from rewire_jax.methods.base import Candidates, Method, Policy, Purpose, Selection
 from rewire_jax.methods.rewire_cloning import with_cloning

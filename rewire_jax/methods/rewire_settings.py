@@ -6,15 +6,8 @@ from typing import Literal
 
 import jax.numpy as jnp
 
-from rewire_jax.core.settings import (
-    flag,
-    require,
-    require_counts,
-    require_weights,
-    settings,
-    static,
-    traced,
-)
+from rewire_jax.core.arguments import flag, require, require_counts, require_weights
+from rewire_jax.core.settings import settings, static, traced
 
 # The authors' distillation sums over both states of each of 256 transitions, and
 # the published alpha belongs to that sum.

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from rewire_jax.core.arguments import check_seconds, check_whole
+from rewire_jax.core.arguments import check_seconds, check_whole, require
 from rewire_jax.core.errors import UserError, writing
-from rewire_jax.core.settings import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.geom_trajectory import Film
 from rewire_jax.envs.scenarios import Scenario, make_scenario

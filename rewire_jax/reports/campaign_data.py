@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import require
 from rewire_jax.reports.data_files import csv_text
 from rewire_jax.run.campaign_file import Campaign, read_campaign
 from rewire_jax.run.campaign_jobs import Job, folder_of, jobs_of

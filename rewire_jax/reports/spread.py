@@ -51,6 +51,12 @@ class Interval:
         ends = f"[{number(self.low, scale)}, {number(self.high, scale)}]"
         return f"{number(self.value, scale)} {ends}"
 
+    def differs_from(self, value: float) -> bool:
+        """Whether the interval excludes a value."""
+        if self.low is None or self.high is None:
+            return False
+        return not self.low <= value <= self.high
+
     def columns(self, name: str) -> dict[str, Any]:
         """The ends as columns of a CSV."""
         return {f"{name}_low": self.low, f"{name}_high": self.high}

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.reports import run_report, sweep_report
 from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import summarize
@@ -17,7 +17,7 @@ from rewire_jax.storage.sweep_results import read_sweep
 
 
 def write_report(
-    folders: Sequence[str | Path],
+    folders: Sequence[str | Path] | str | Path,
     out: str | Path,
     *,
     single: Sequence[str | Path] = (),
@@ -28,7 +28,7 @@ def write_report(
     Runs that know success are measured by their success rates, others by returns.
 
     Args:
-        folders: folders of the runs, or of the sweep.
+        folders: folders of the runs, or of the sweep; or one folder.
         out: the folder to write into; made where missing, an old report is replaced.
         single: folders of finished runs that learn one task each, one for every task
             of the sequence: forward transfer of success rates is measured from them.
@@ -42,6 +42,10 @@ def write_report(
             comparable, a task lacks its single-task run, or `out` cannot be written or
             has files of these names that no report wrote.
     """
+    folders, single = (
+        [some] if isinstance(some, str | Path) else list(some)
+        for some in (folders, single)
+    )
     known = ", ".join(SUCCESS)
     require(success in SUCCESS, f"unknown success {success!r}: choose one of {known}")
     for folder in (*folders, *single):

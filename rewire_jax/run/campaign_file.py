@@ -27,8 +27,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from rewire_jax.core.arguments import flag, require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import MOST_SEEDS, Settings, flag, require, validate
+from rewire_jax.core.settings import MOST_SEEDS, Settings, validate
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.storage.json_lines import raw
 from rewire_jax.training.presets import preset

@@ -11,8 +11,8 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import require
 from rewire_jax.run.campaign_file import Campaign, PlannedRun, as_populations
 from rewire_jax.run.campaign_jobs import start
 from rewire_jax.storage import run_folder

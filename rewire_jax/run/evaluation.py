@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.arguments import check_optional, check_whole
-from rewire_jax.core.settings import MOST_EPISODES, require
+from rewire_jax.core.arguments import check_optional, check_whole, require
+from rewire_jax.core.settings import MOST_EPISODES
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection
 from rewire_jax.methods.spec import Spec
-from rewire_jax.run import episode_parts, run_state, task_choice
+from rewire_jax.run import episode_parts, header_check, run_state, task_choice
 from rewire_jax.run.run_state import saved
 from rewire_jax.run.task_choice import Choice, Trials
 from rewire_jax.storage import run_folder
@@ -155,6 +155,7 @@ def evaluate(
     )
     _, settings = saved(folder)
     plan = prepare(settings)
+    header_check.check_tasks(folder, plan)
     stage = run_state.latest(folder) if stage is None else stage
     policies, active = _policies(folder, stage, plan)
     choice = None

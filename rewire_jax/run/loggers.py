@@ -15,7 +15,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-from rewire_jax.core.settings import Settings, require
+from rewire_jax.core.arguments import require
+from rewire_jax.core.settings import Settings
 from rewire_jax.core.settings_json import to_json
 from rewire_jax.storage import run_folder
 from rewire_jax.training.population import Member

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.arguments import check_optional, check_whole
+from rewire_jax.core.arguments import check_optional, check_whole, require
 from rewire_jax.core.errors import UserError
-from rewire_jax.core.settings import Settings, require
+from rewire_jax.core.settings import Settings
 from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec

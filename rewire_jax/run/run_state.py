@@ -29,6 +29,10 @@ from rewire_jax.training.sac import TrainState
 _FOLDER = "checkpoints"
 
 
+class OtherRunError(checkpoint.CheckpointError):
+    """A checkpoint of another run."""
+
+
 class RunState(NamedTuple):
     """The state of a run; between tasks `state` is None and `steps` is 0.
 
@@ -142,14 +146,17 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
       say: is told about every checkpoint that cannot be used, and about copies.
 
     Raises:
-      UserError: `checkpoints` is a link or no folder.
+      UserError: `checkpoints` is a link or no folder, or all in it that can be read are
+        of another run: nothing of it is overwritten.
     """
     run_folder.check_own(folder / _FOLDER)
     found = sorted((folder / _FOLDER).glob("task-*"), reverse=True)
+    foreign: OtherRunError | None = None
     for path in found:
         try:
             standing, marks = _load(path, plan)
         except checkpoint.CheckpointError as error:
+            foreign = error if isinstance(error, OtherRunError) else foreign
             say(f"{error}; falling back to the one before")
             continue
         changed = run_folder.changed(folder, marks)
@@ -163,6 +170,8 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
             f"{changed} has lost or foreign rows; falling back to the checkpoint "
             f"before {path.name}"
         )
+    if foreign is not None:
+        raise foreign
     _keep_copies(folder, {}, say)
     run_folder.cut(folder, {})
     return None
@@ -245,6 +254,8 @@ def read_policies(
         wanted = {"policy": like, "counts": _counts(num_slots)}
         items, _ = checkpoint.load(path, wanted)
         return items["policy"], items["counts"]["active"]
+    except OtherRunError:
+        raise
     except checkpoint.CheckpointError as error:
         raise checkpoint.CheckpointError(
             f"{error}; delete it and newer checkpoints, and --resume trains that again"
@@ -269,8 +280,9 @@ def _facts(path: Path, owner: Mapping[str, Any]) -> dict[str, Any]:
         raise checkpoint.CheckpointError(f"checkpoint {path} was written as {name}")
     for part, own in owner.items():
         if facts.get("identity", {}).get(part) != own:
-            raise checkpoint.CheckpointError(
-                f"checkpoint {path} belongs to another run: it has other {part}"
+            raise OtherRunError(
+                f"checkpoint {path} belongs to another run: it has other {part}; if "
+                f"{run_folder.HEADER} has changed, restore it"
             )
     return facts
 

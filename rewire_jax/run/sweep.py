@@ -22,25 +22,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.arguments import check_whole
+from rewire_jax.core.arguments import check_whole, require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
-from rewire_jax.core.settings import Settings, require, validate
-from rewire_jax.core.settings_json import to_json
+from rewire_jax.core.settings import Settings, validate
 from rewire_jax.envs.scenarios import Scenario
-from rewire_jax.run import loggers, run_state
+from rewire_jax.run import header_check, loggers, run_state, sweep_members
 from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.ranking import rank
 from rewire_jax.run.run_state import RunState
 from rewire_jax.run.sweep_grid import (
-    describe,
     draws,
     grid,
     make_members,
     read,
-    values_of,
+    read_axis,
 )
 from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
@@ -277,7 +275,7 @@ def sweep(
     check_whole("--random", random)
     validate(settings)
     loggers.check(log)
-    given = {name: [float(x) for x in values] for name, values in (axes or {}).items()}
+    given = {name: read_axis(name, values) for name, values in (axes or {}).items()}
     require(bool(given or configurations), "a sweep needs an axis: --alpha 0 1e-5")
     every = len(configurations) or random or math.prod(map(len, given.values()))
     plan = prepare(settings, scenario, population.of_run(settings)[:1])
@@ -287,7 +285,7 @@ def sweep(
         configurations = draws(given, random, settings) if random else grid(given)
     settings, members = make_members(settings, configurations)
     plan = prepare(settings, scenario, members[:1])
-    header = _header(
+    header = sweep_members.make_header(
         plan, members, tuple(configurations[0]), given, random=random, halving=halving
     )
     with ExitStack() as stack:
@@ -295,6 +293,7 @@ def sweep(
             start = None if resume else header
             stack.enter_context(run_folder.held(folder, start, "sweep"))
         run_folder.compare(folder, plan.settings, "sweep")
+        header_check.check_tasks(folder, plan, "sweep")
         saved = run_folder.read_header(folder, "sweep")
         require(
             all(saved[name] == header[name] for name in ("members", "halving")),
@@ -318,33 +317,3 @@ def sweep(
         print(f"{need}; {len(members)} members, {size} at a time", file=sys.stderr)
         made.run()
     return folder
-
-
-def _header(
-    plan: Plan,
-    members: Sequence[Member],
-    names: Sequence[str],
-    axes: Mapping[str, Any],
-    **asked: int,
-) -> dict[str, Any]:
-    """Returns the contents of the sweep's settings.json.
-
-    Args:
-      plan: plan of any member.
-      members: all members.
-      names: names of the settings in which members differ.
-      axes: names and values of the axes as given; if empty, the members' values.
-      asked: other arguments of the sweep.
-    """
-    told = describe(members, names, plan.settings.seeds)
-    return {
-        "kind": "sweep",
-        "settings": to_json(plan.settings),
-        "axes": axes or values_of(told),
-        **asked,
-        "members": told,
-        "tasks": plan.names,
-        "spec": plan.spec._asdict(),
-        "episode_length": plan.scenario.environment.episode_length,
-        "provenance": run_folder.provenance(),
-    }

@@ -3,17 +3,19 @@
 import dataclasses
 import itertools
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from rewire_jax.core.arguments import flag, require
+from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import (
     SacSettings,
     Settings,
-    flag,
-    require,
     traced_fields,
+    typed_settings,
     validate,
 )
 from rewire_jax.methods import find_method
@@ -28,6 +30,23 @@ _DECADE = 10.0
 def names(settings: Settings) -> dict[str, type]:
     """The settings that members of one population may differ in, and their types."""
     return traced_fields(SacSettings) | traced_fields(type(settings.options))
+
+
+def read_axis(name: str, values: Any) -> list[float]:
+    """The values of an axis.
+
+    Raises:
+      UserError: they are not a list of numbers.
+    """
+    array = np.asarray(values, dtype=object)
+    numeric = array.ndim == 1 and all(
+        isinstance(x, numbers.Real) and not isinstance(x, bool) for x in array
+    )
+    require(numeric, f"{flag(name)} needs a list of numbers, not {values!r:.80}")
+    try:
+        return [float(value) for value in array]
+    except OverflowError:
+        raise UserError(f"{flag(name)} has a number that is too large") from None
 
 
 def grid(axes: Mapping[str, Sequence[float]]) -> list[Values]:
@@ -95,6 +114,7 @@ def configure(settings: Settings, values: Mapping[str, float]) -> Settings:
         options=dataclasses.replace(settings.options, **options),
     )
     validate(settings)
+    settings = typed_settings(settings)
     return dataclasses.replace(settings, options=settings.options.checked())
 
 
@@ -160,7 +180,9 @@ def _check(name: str, value: float, kinds: Mapping[str, type]) -> None:
         f"no sweep over {name!r}: choose among {', '.join(sorted(kinds))}",
     )
     word = flag(name)
-    require(math.isfinite(value), f"{word} must be finite, not {value}")
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    require(real, f"{word} must be a number, not {value!r:.80}")
+    require(abs(value) < math.inf, f"{word} must be finite, not {value}")
     require(
         kinds[name] is not int or value == int(value),
         f"{word} must be a whole number, not {value:g}",

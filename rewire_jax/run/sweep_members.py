@@ -1,17 +1,19 @@
-"""Where a member of a sweep is."""
+"""What a sweep's folder says of its members, and where they are."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.run import run_state
-from rewire_jax.run.sweep_grid import describe, make_members
+from rewire_jax.run.sweep_grid import describe, make_members, values_of
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import reading
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches
 from rewire_jax.training.population import Member
+from rewire_jax.training.run_setup import Plan
 
 
 class Found(NamedTuple):
@@ -49,6 +51,36 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
                 return Found(inside, each, place, num_slots, tuple(members))
     when = "any task" if stage is None else f"task {stage}"
     raise UserError(f"{folder}: member {member} has not been trained on {when} yet")
+
+
+def make_header(
+    plan: Plan,
+    members: Sequence[Member],
+    names: Sequence[str],
+    axes: Mapping[str, Any],
+    **asked: int,
+) -> dict[str, Any]:
+    """Returns the contents of the sweep's settings.json.
+
+    Args:
+      plan: plan of any member.
+      members: all members.
+      names: names of the settings in which members differ.
+      axes: names and values of the axes as given; if empty, the members' values.
+      asked: other arguments of the sweep.
+    """
+    told = describe(members, names, plan.settings.seeds)
+    return {
+        "kind": "sweep",
+        "settings": to_json(plan.settings),
+        "axes": axes or values_of(told),
+        **asked,
+        "members": told,
+        "tasks": plan.names,
+        "spec": plan.spec._asdict(),
+        "episode_length": plan.scenario.environment.episode_length,
+        "provenance": run_folder.provenance(),
+    }
 
 
 def members_of(

@@ -17,7 +17,7 @@ from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.base import Task
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods.base import Selection
-from rewire_jax.run import loggers, run_state
+from rewire_jax.run import header_check, loggers, run_state
 from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
@@ -320,6 +320,7 @@ def train(
         stack.enter_context(run_folder.held(folder, None if resume else header))
         if resume:
             run_folder.compare(folder, plan.settings)
+            header_check.check_tasks(folder, plan)
         display = stack.enter_context(
             progress(
                 plan.names, plan.interactions, [m.name for m in plan.members], label

@@ -50,6 +50,12 @@ SPEC = {"observations": Field(int, 1), "actions": Field(int, 1)}
 """Of a header's sizes: those that its settings do not determine."""
 
 
+SWEEP = {"random": Field(int, 0), "halving": Field(int, 1)}
+"""Of a sweep's header: what its caller asked for."""
+HEADER = {"episode_length": Field(int, 1)}
+"""Of a header: what reports need besides the settings."""
+
+
 def results(tasks: int, stages: range) -> Fields:
     """Fields of `results.jsonl`, of so many tasks and of these stages."""
     return _OWNER | {

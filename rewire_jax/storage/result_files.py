@@ -79,6 +79,7 @@ def read_header(folder: Path, kind: str) -> Results:
             raise ValueError("tasks are no list of names")
         dict(header["provenance"].get("versions", {}))  # as pages show them
         fields.checked(header["settings"], fields.SETTINGS)
+        fields.checked(header, fields.HEADER)
         results = Results(
             folder=folder,
             settings=dict(header["settings"]),

@@ -24,8 +24,9 @@ from typing import Any
 import jax
 from filelock import FileLock, Timeout
 
+from rewire_jax.core.arguments import flag
 from rewire_jax.core.errors import UserError, writing
-from rewire_jax.core.settings import Settings, flag
+from rewire_jax.core.settings import Settings
 from rewire_jax.core.settings_json import from_json, to_json
 from rewire_jax.storage.json_lines import document, raw, reading
 from rewire_jax.version import __version__

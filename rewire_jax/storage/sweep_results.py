@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rewire_jax.core.errors import UserError
+from rewire_jax.storage import fields
 from rewire_jax.storage.json_lines import document, reading
 from rewire_jax.storage.result_files import (
     Array,
@@ -106,7 +107,7 @@ def read_sweep(folder: str | Path) -> SweepData:
     count, tasks = len(design["seeds"]), len(head.tasks)
     trained, hours = np.zeros((count, tasks), bool), 0.0
     rows: Rows = {}
-    for now, place, members in _batches(head.folder, count, tasks):
+    for now, place, members in each_batch(head.folder, count, tasks):
         trained[members, now] = True
         check_tables(place)
         stages = range(now, now + 1)
@@ -146,12 +147,13 @@ def read_sweep(folder: str | Path) -> SweepData:
 def _design(head: Results) -> dict[str, Any]:
     """What a header says of the members, see `SweepData`."""
     with reading(head.folder / HEADER):
+        asked = fields.checked(head.header, fields.SWEEP)
         members = list(head.header["members"])
         if [member["member"] for member in members] != list(range(len(members))):
             raise ValueError("members are not in order")
         return {
-            "random": int(head.header["random"]),
-            "halving": int(head.header["halving"]),
+            "random": asked["random"],
+            "halving": asked["halving"],
             "axes": {
                 name: np.array([member["values"][name] for member in members], float)
                 for name in members[0]["values"]
@@ -190,10 +192,19 @@ def read_batches(path: Path) -> tuple[list[list[int]], int]:
         return batches, size
 
 
-def _batches(
+def each_batch(
     folder: Path, count: int, tasks: int
 ) -> Iterator[tuple[int, Path, list[int]]]:
-    """Stage, folder and members of each batch of the stages that have begun."""
+    """Stage, folder and members of each batch of the stages that have begun.
+
+    Args:
+      folder: folder of the sweep.
+      count: number of its members.
+      tasks: number of its tasks.
+
+    Raises:
+      UserError: a file is damaged, or has other members.
+    """
     for stage in range(tasks):
         path = batches_of(folder, stage)
         if not path.exists():

@@ -38,6 +38,7 @@ def mean_action(
     Raises:
       AssertionError: an observation of another length than the method was made for.
     """
+    observation = jnp.asarray(observation)
     chex.assert_axis_dimension(observation, -1, spec.observations)
     mean, _ = method.act(policy, observation)
     return jnp.tanh(mean)

@@ -8,7 +8,7 @@ import jax
 from jax.sharding import Mesh
 
 from rewire_jax.core import kept_programs
-from rewire_jax.core.settings import require
+from rewire_jax.core.arguments import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.methods.base import Candidates, CandidateScore, Method
 from rewire_jax.training import host_train_loop, population, rollout, sac

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rewire_jax.core.settings import SacSettings, Settings, require
+from rewire_jax.core.arguments import require
+from rewire_jax.core.settings import SacSettings, Settings
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import find_method

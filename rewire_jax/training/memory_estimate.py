@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import Jaxpr, JaxprEqn, Var, jaxprs_in_params
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.machine_memory import machine_bytes
-from rewire_jax.core.settings import require
 from rewire_jax.envs.base import HostEnvironment
 from rewire_jax.methods import find_method
 from rewire_jax.methods.shared import map_own

@@ -3,7 +3,8 @@
 import dataclasses
 from typing import Literal, get_args
 
-from rewire_jax.core.settings import SacSettings, Settings, require
+from rewire_jax.core.arguments import require
+from rewire_jax.core.settings import SacSettings, Settings
 from rewire_jax.envs.scenarios import SCENARIOS, Scenario
 from rewire_jax.methods import find_method
 
@@ -76,6 +77,10 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     Raises:
       UserError: an unknown method or profile.
     """
+    require(
+        isinstance(scenario, Scenario),
+        f"scenario must be a Scenario, see make_scenario, not {scenario!r:.80}",
+    )
     profiles = get_args(Profile)
     require(
         profile in profiles,

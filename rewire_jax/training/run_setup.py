@@ -5,16 +5,18 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from rewire_jax.core.arguments import flag, require
+from rewire_jax.core.errors import UserError
 from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import (
     SacSettings,
     Settings,
-    flag,
-    require,
     traced_fields,
+    typed_settings,
     validate,
     with_traced,
 )
@@ -160,7 +162,16 @@ def complete(
     Raises:
       UserError: a setting is invalid, or a task has NaN.
     """
+    require(
+        isinstance(settings, Settings),
+        f"settings must be Settings, such as preset gives, not {settings!r:.80}",
+    )
+    require(
+        scenario is None or isinstance(scenario, Scenario),
+        f"scenario must be a Scenario, see make_scenario, not {scenario!r:.80}",
+    )
     validate(settings)
+    settings = typed_settings(settings)
     options = find_method(settings.method).settings
     require(
         isinstance(settings.options, options),
@@ -200,30 +211,51 @@ def with_values(
     Raises:
       UserError: another class, or an invalid value. What JAX traces is not checked.
     """
-    own = {"sac": settings.sac, "options": settings.options}
-    given = {"sac": sac or settings.sac, "options": options or settings.options}
-    known = {}
-    for part, values in given.items():
-        kind = type(own[part])
-        require(
-            isinstance(values, kind),
-            f"{part} must be a {kind.__name__}, not {values!r:.80}",
-        )
-        fixed = {}
-        for name in traced_fields(kind):
-            value = getattr(values, name)
-            if not isinstance(value, jax.core.Tracer):
-                shape = np.shape(value)
-                text = f"{flag(name)} has the shape {shape}: use jax.vmap over values"
-                require(not shape, text)
-                fixed[name] = value.item() if hasattr(value, "item") else value
-        known[part] = dataclasses.replace(own[part], **fixed)
+    known = {
+        "sac": _known(settings.sac, sac, "sac"),
+        "options": _known(settings.options, options, "options"),
+    }
     validate(dataclasses.replace(settings, **known))
     known["options"].checked()
     return (
-        with_traced(settings.sac, given["sac"]),
-        with_traced(settings.options, given["options"]),
+        with_traced(settings.sac, settings.sac if sac is None else sac),
+        with_traced(settings.options, settings.options if options is None else options),
     )
+
+
+def _known(own: Any, given: Any, name: str) -> Any:
+    """Settings with the values of others, apart from those that JAX traces.
+
+    Args:
+      own: checked and complete settings of SAC or of the method.
+      given: settings with the wanted values; None for the own ones.
+      name: name of the argument.
+
+    Raises:
+      UserError: another class, a static value that differs, or a value that is no
+        single number.
+    """
+    if given is None:
+        return own
+    kind = type(own)
+    if not isinstance(given, kind):
+        raise UserError(f"{name} must be a {kind.__name__}, not {given!r:.80}")
+    values = {}
+    for field in dataclasses.fields(kind):
+        value, before = getattr(given, field.name), getattr(own, field.name)
+        if field.name not in traced_fields(kind):
+            # What `checked` fills in may be as it is by default.
+            same = value is before or value in (before, field.default)
+            require(same, f"{flag(field.name)} cannot differ from {before} here")
+            continue
+        shape = np.shape(value)
+        require(not shape, f"{flag(field.name)} has the shape {shape}: use jax.vmap")
+        if not isinstance(value, jax.core.Tracer):
+            values[field.name] = value.item() if hasattr(value, "item") else value
+        elif not jnp.issubdtype(value.dtype, jnp.floating):
+            whole = jnp.issubdtype(value.dtype, jnp.integer)
+            require(whole, f"{flag(field.name)} must be a number, not {value.dtype}")
+    return dataclasses.replace(own, **values)
 
 
 def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:

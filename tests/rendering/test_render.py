@@ -29,7 +29,12 @@ STEPS = 12
 # A backend with links, from which geometries can be found.
 CHEETAH = "halfcheetah/forgetting", "positional"
 FEET = {"geom5", "geom8"}  # halfcheetah's
-SWEEP = {"kind": "sweep", "members": [{"values": {}}] * 2}
+SWEEP = {
+    "kind": "sweep",
+    "members": [
+        {"member": n, "configuration": 0, "seed": 5 + n, "values": {}} for n in (0, 1)
+    ],
+}
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

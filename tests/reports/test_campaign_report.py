@@ -157,12 +157,12 @@ def test_known_numbers_with_an_uncertain_reference(tmp_path: Path) -> None:
 
     matrix = section.improvement
     assert matrix[1][2].value == 1
-    assert matrix[1][2].low > 0.5
+    assert matrix[1][2].differs_from(0.5)
     assert matrix[2][1].value == 0
     # The same returns on all tasks.
     same = probability_of_improvement(ends["ft1"], ends["sac_n"])
     assert matrix[2][0].value == same == 0.5
-    assert matrix[2][0].low <= 0.5 <= matrix[2][0].high
+    assert not matrix[2][0].differs_from(0.5)
     assert matrix[0][0] is None
     text = (tmp_path / "report.html").read_text()
     bold = re.findall(r"<strong>([\d.]+) \[", text)

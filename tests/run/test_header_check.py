@@ -1,11 +1,13 @@
 """Headers that were changed after training."""
 
+import dataclasses
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import rewire_jax
@@ -101,3 +103,61 @@ def test_other_sizes_than_the_checkpoint_has(
     copy = changed(trained["run"], tmp_path / "copy", grow)
     with pytest.raises(UserError, match="does not fit"):
         rewire_jax.load_policies(copy)
+
+
+def test_changed_settings_are_blamed_and_nothing_is_trained_again(
+    trained: dict[str, Path], tmp_path: Path
+) -> None:
+    def change(header: Header) -> None:
+        header["settings"]["options"]["beta"] = 7.0
+
+    copy = changed(trained["run"], tmp_path / "copy", change)
+    before = {path: path.read_bytes() for path in copy.glob("**/*.json*")}
+    settings = small(seeds=2)
+    options = dataclasses.replace(settings.options, beta=7.0)
+    with pytest.raises(UserError, match=r"settings\.json"):
+        rewire_jax.load_policies(copy)
+    with pytest.raises(UserError, match="another run"):
+        settings = dataclasses.replace(settings, options=options)
+        rewire_jax.train(settings, copy, resume=True)
+    assert {path: path.read_bytes() for path in copy.glob("**/*.json*")} == before
+
+
+def test_batches_of_members_that_are_not_there(
+    trained: dict[str, Path], tmp_path: Path
+) -> None:
+    copy = changed(
+        trained["sweep"],
+        tmp_path / "copy",
+        lambda h: h["members"].__delitem__(slice(2)),
+    )
+    with pytest.raises(UserError, match=r"batches\.json"):
+        write_report([copy], tmp_path / "report")
+
+
+def test_numbers_may_be_of_any_kind(tmp_path: Path) -> None:
+    settings = small(seeds=np.int64(1))
+    sac = dataclasses.replace(settings.sac, discount=np.float64(0.5))
+    options = dataclasses.replace(settings.options, beta=100)
+    settings = dataclasses.replace(settings, sac=sac, options=options)
+    folder = rewire_jax.train(settings, tmp_path / "run")
+    options = dataclasses.replace(options, beta=100.0)
+    again = dataclasses.replace(settings, options=options, seeds=1)
+    results = (folder / "results.jsonl").read_bytes()
+    rewire_jax.train(again, folder, resume=True)
+    assert (folder / "results.jsonl").read_bytes() == results
+    # As a tool that writes whole numbers without a point would do it.
+    changed(
+        folder, tmp_path / "copy", lambda h: h["settings"]["options"].update(beta=100)
+    )
+    write_report([tmp_path / "copy"], tmp_path / "report")
+
+
+def test_other_tasks_of_the_same_name(trained: dict[str, Path], tmp_path: Path) -> None:
+    copy = changed(
+        trained["run"], tmp_path / "copy", lambda h: h.update(tasks=["one", "two"])
+    )
+    with pytest.raises(UserError, match="other tasks"):
+        rewire_jax.evaluate(copy)
+    with pytest.raises(UserError, match="other tasks"):
+        rewire_jax.train(small(seeds=2), copy, resume=True)

@@ -111,3 +111,30 @@ def test_settings(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=said):
         rewire_jax.train(dataclasses.replace(tiny(), **changes), tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: rewire_jax.make_train("settings"),
+        lambda: rewire_jax.make_train(tiny(), "probe/reach"),
+        lambda: rewire_jax.preset("probe/reach", "ft1"),
+        lambda: rewire_jax.make_scenario(5),
+        lambda: rewire_jax.register_scenario("probe/reach"),
+        lambda: ScenarioSpec("own", "reach", ("a",), 1, 1),
+        lambda: ScenarioSpec("own", "reach", (x for x in (NORMAL,)), 1, 1),
+        lambda: ScenarioSpec("own", None, (NORMAL,), 1, 1),
+        lambda: TaskChange("x", bodies=["foot"]),
+        lambda: TaskChange("x", bodies={"foot": math.inf}, actions={"foot": 1.0}),
+        lambda: TaskChange("x", gravity=True),
+        lambda: rewire_jax.sweep(small(), HERE, axes={"alpha": "12"}),
+        lambda: rewire_jax.sweep(small(), HERE, axes={"alpha": [True]}),
+        lambda: rewire_jax.sweep(small(), HERE, axes={"alpha": 0.1}),
+        lambda: rewire_jax.sweep(small(), HERE, axes={"alpha": [10**400]}),
+        lambda: rewire_jax.sweep(small(), HERE, configurations=[{"alpha": "1"}]),
+    ],
+)
+def test_what_is_of_another_class(call: Callable[[], Any]) -> None:
+    with pytest.raises(UserError):
+        call()
+    assert not HERE.exists()

@@ -154,6 +154,9 @@ def test_a_key_of_another_kind_is_refused(key: Any) -> None:
         ("sac", {"lr_critic": jnp.ones(2)}, "--lr-critic"),
         ("sac", {"lr_critic": "fast"}, "--lr-critic"),
         ("options", {"modes": 4}, "--modes"),
+        ("sac", {"hidden": 32}, "--hidden"),
+        ("sac", {"network": "layer_norm"}, "--network"),
+        ("options", {"alignment": "off"}, "--alignment"),
         ("options", {"tau": jnp.float32(0)}, "--tau"),
     ],
 )
@@ -167,6 +170,20 @@ def test_wrong_values_of_other_settings_are_refused(
 
 
 @pytest.mark.parametrize("part", ["sac", "options"])
-def test_settings_of_another_class_are_refused(part: str) -> None:
+@pytest.mark.parametrize("value", [small("rewire"), 0, {}])
+def test_settings_of_another_class_are_refused(part: str, value: Any) -> None:
     with pytest.raises(UserError, match=part):
-        make_train(small("rewire"))(jax.random.key(0), **{part: small("rewire")})
+        make_train(small("rewire"))(jax.random.key(0), **{part: value})
+
+
+@pytest.mark.parametrize("value", [jnp.ones(1), jnp.ones(32), jnp.asarray(True)])
+def test_traced_values_must_be_single_numbers(value: jax.Array) -> None:
+    settings = small("ft1")
+    train = make_train(settings)
+
+    def at(scale: jax.Array) -> Any:
+        sac = dataclasses.replace(settings.sac, reward_scale=scale)
+        return train(jax.random.key(0), sac=sac)
+
+    with pytest.raises(UserError, match="--reward-scale"):
+        jax.eval_shape(at, value)
