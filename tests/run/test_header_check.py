@@ -117,8 +117,8 @@ def test_changed_settings_are_blamed_and_nothing_is_trained_again(
     options = dataclasses.replace(settings.options, beta=7.0)
     with pytest.raises(UserError, match=r"settings\.json"):
         rewire_jax.load_policies(copy)
+    settings = dataclasses.replace(settings, options=options)
     with pytest.raises(UserError, match="another run"):
-        settings = dataclasses.replace(settings, options=options)
         rewire_jax.train(settings, copy, resume=True)
     assert {path: path.read_bytes() for path in copy.glob("**/*.json*")} == before
 
@@ -126,11 +126,10 @@ def test_changed_settings_are_blamed_and_nothing_is_trained_again(
 def test_batches_of_members_that_are_not_there(
     trained: dict[str, Path], tmp_path: Path
 ) -> None:
-    copy = changed(
-        trained["sweep"],
-        tmp_path / "copy",
-        lambda h: h["members"].__delitem__(slice(2)),
-    )
+    def lose(header: Header) -> None:
+        del header["members"][2:]
+
+    copy = changed(trained["sweep"], tmp_path / "copy", lose)
     with pytest.raises(UserError, match=r"batches\.json"):
         write_report([copy], tmp_path / "report")
 
@@ -146,11 +145,12 @@ def test_numbers_may_be_of_any_kind(tmp_path: Path) -> None:
     results = (folder / "results.jsonl").read_bytes()
     rewire_jax.train(again, folder, resume=True)
     assert (folder / "results.jsonl").read_bytes() == results
+
     # As a tool that writes whole numbers without a point would do it.
-    changed(
-        folder, tmp_path / "copy", lambda h: h["settings"]["options"].update(beta=100)
-    )
-    write_report([tmp_path / "copy"], tmp_path / "report")
+    def shorten(header: Header) -> None:
+        header["settings"]["options"]["beta"] = 100
+
+    write_report(changed(folder, tmp_path / "copy", shorten), tmp_path / "report")
 
 
 def test_other_tasks_of_the_same_name(trained: dict[str, Path], tmp_path: Path) -> None:
