@@ -34,7 +34,7 @@ def results(comparison: Comparison) -> Table:
     for source in comparison.sources:
         heads.append(f"paper's {source.table}, {source.name} ({source.unit})")
         if source.sized:
-            heads.append("its model size")
+            heads.append("model size in the paper")
     rows = []
     for summary in comparison.summaries:
         row = [

@@ -111,7 +111,7 @@ def test_sac_n_normalises(tmp_path: Path) -> None:
     row = cells(report.page, "Ours (rewire)")
     assert row["performance (÷ SAC-N)"] == "0.87 ± 0.07"
     assert row["paper's Table 1, HalfCheetah (4 scenarios) (÷ SAC-N)"] == "1.17 ± 0.15"
-    assert row["its model size"] == "2.1"
+    assert row["model size in the paper"] == "2.1"
     assert row["paper's Table 3, this scenario (÷ SAC-N)"] == "1.31 ± 0.21"
     row = cells(report.page, "SAC-N")
     assert row["model size"] == "8.00"
