@@ -143,7 +143,7 @@ def test_damaged_line_is_named(tmp_path, text):
         ('"member": 3', '"member": 5', "members are not in order"),
         ('"alpha": 0.0}', '"alpha": "x"}', "could not convert"),
         ('"values": {"modes"', '"values": {"mode"', "no 'modes'"),
-        ('"halving": 1', '"halving": null', "NoneType"),
+        ('"halving": 1', '"halving": null', "halving is None"),
     ],
 )
 def test_damaged_header_is_named(tmp_path, old, new, why):
