@@ -171,8 +171,9 @@ class Report(Flags):
     """Writes tables and plots of runs on the same scenario, only from their files.
 
     Attributes:
-      runs: folders of runs, finished or not, or of one sweep. On Brax, if exactly one
-        of them is a usable SAC-N run, all scores are divided by its performance.
+      runs: folders of runs, finished or not, or of one sweep. On Brax, all scores
+        are divided by the performance of the SAC-N run, if there is exactly one and it
+        is usable.
       out: folder for the report; an earlier report there is replaced.
       single: folders of runs on one task each, with the same budget; the report then
         includes Continual World's forward transfer.
