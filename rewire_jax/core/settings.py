@@ -225,7 +225,8 @@ _AT_LEAST: dict[str, float] = {
     "l2_init": 0,
     "parseval": 0,
 }
-# Counters and floats have 32 bits. The other limits only prevent endless loops.
+# Counters and floats have 32 bits. The other limits prevent endless loops, and for modes
+# the memory of all pairs of them.
 _LARGEST = 2**31
 _LARGEST_FLOAT, _SMALLEST_FLOAT = 3.4e38, 1.2e-38
 MOST_SEEDS = 4_096
@@ -233,6 +234,7 @@ MOST_EPISODES = 2**20
 _AT_MOST = {
     "seeds": MOST_SEEDS,
     "depth": 1_000,
+    "modes": 1_000,
     "eval_episodes": MOST_EPISODES,
     "selection_episodes": MOST_EPISODES,
 }

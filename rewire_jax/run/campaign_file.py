@@ -247,6 +247,7 @@ def _settings(
     given = {key: entry[key] for key in ("profile", "backend") if key in entry}
     table = entry.get("settings", {})
     values = {name.replace("-", "_"): value for name, value in table.items()}
+    require(len(values) == len(table), "a setting is there twice, with - and with _")
     place = make_scenario(scenario, given.get("backend"), values.get("reward", "v2"))
     settings = preset(place, method, given.get("profile", "paper"))
     parts: dict[str, dict[str, Any]] = {"": {}, "sac": {}, "options": {}}

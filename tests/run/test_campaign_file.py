@@ -105,6 +105,11 @@ OTHER = ENTRY.replace("ft1", "rewire")
         ("a = " + "[" * 5000, "", "TOML"),
         (ENTRY + "[runs.settings]\nseed = 1\n", "line 1", "seed"),
         (ENTRY + "[runs.settings]\nmodes = 1\n", "line 1", "modes"),
+        (
+            ENTRY + "[runs.settings]\nlr-policy = 1e-3\nlr_policy = 1e-4\n",
+            "line 1",
+            "twice",
+        ),
         (ENTRY + "[runs.settings]\ninteractions = 0\n", "line 1", "--interactions"),
         (ENTRY + "[runs.settings]\nbatch_size = 0\n", "line 1", "--batch-size"),
         (ENTRY + '[runs.settings]\nhidden = "wide"\n', "line 1", "hidden"),
