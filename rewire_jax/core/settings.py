@@ -225,8 +225,8 @@ _AT_LEAST: dict[str, float] = {
     "l2_init": 0,
     "parseval": 0,
 }
-# Counters and floats have 32 bits. The other limits prevent endless loops, and for modes
-# the memory of all pairs of them.
+# Counters and floats have 32 bits. The other limits prevent endless loops, and the
+# memory of all pairs of modes.
 _LARGEST = 2**31
 _LARGEST_FLOAT, _SMALLEST_FLOAT = 3.4e38, 1.2e-38
 MOST_SEEDS = 4_096
