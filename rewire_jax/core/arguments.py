@@ -35,6 +35,14 @@ def require_weights(group: Any, *names: str) -> None:
         require(fits, f"{flag(name)} must be at least 0 and finite, not {value}")
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a single finite number, of Python, NumPy or JAX."""
+    if getattr(value, "shape", None) == () and hasattr(value, "item"):
+        value = value.item()
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    return real and abs(value) < math.inf
+
+
 def check_whole(name: str, value: Any, least: int = 0, most: int = MOST) -> None:
     """Raises `UserError` unless a value is a whole number in a range.
 
@@ -59,8 +67,7 @@ def check_optional(name: str, value: Any, least: int = 0, most: int = MOST) -> N
 
 def check_seconds(name: str, value: Any) -> None:
     """Raises `UserError` unless a value is a finite length of time, or 0."""
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not real or not 0 <= value < math.inf:
+    if not is_number(value) or value < 0:
         raise UserError(f"{name} must be a number of seconds, not {value!r:.80}")
 
 

@@ -1,7 +1,5 @@
 """The interface of every environment: pure functions over pytrees."""
 
-import math
-import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -9,7 +7,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 
-from rewire_jax.core.arguments import check_name
+from rewire_jax.core.arguments import check_name, is_number
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs.geom_trajectory import Film
 
@@ -154,8 +152,7 @@ class TaskChange:
             *self.bodies.items(),
             *self.actions.items(),
         ):
-            real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-            if not real or not abs(value) < math.inf:
+            if not is_number(value):
                 raise UserError(
                     f"{name} of task {self.name!r} must be a finite number, not {value}"
                 )

@@ -167,7 +167,7 @@ def register_scenario(spec: ScenarioSpec) -> None:
     """Registers `spec` by its name. Registering the same spec again is allowed.
 
     Raises:
-      UserError: another scenario has this name.
+      UserError: another scenario has this name, or `spec` is no `ScenarioSpec`.
     """
     _check_spec(spec)
     if SCENARIOS.get(spec.name, spec) != spec:

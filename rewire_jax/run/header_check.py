@@ -36,9 +36,13 @@ def check_header(folder: Path) -> None:
     with reading(folder / run_folder.HEADER):
         count, tasks = len(header["members"]), len(header["tasks"])
 
-    def members(numbers: Sequence[int], settings: Settings) -> Sequence[Member]:
-        every = sweep_members.members_of(folder, header, settings)
-        return [every[number] for number in numbers]
+    @functools.cache
+    def every() -> Sequence[Member]:
+        _, settings = run_state.saved(folder, kind)
+        return sweep_members.members_of(folder, header, settings)
+
+    def members(numbers: Sequence[int], _: Settings) -> Sequence[Member]:
+        return [every()[number] for number in numbers]
 
     for _, place, numbers in each_batch(folder, count, tasks):
         _compare(folder, place, functools.partial(members, numbers))

@@ -77,7 +77,7 @@ class Policies(NamedTuple):
           The task whose policy was chosen, for `act`.
 
         Raises:
-          UserError: `trials` is not positive.
+          UserError: `trials` is no whole number from 1.
         """
         check_whole("trials", trials, 1)
 

@@ -146,8 +146,8 @@ def restore(folder: Path, plan: Plan, say: Callable[[str], None]) -> RunState | 
       say: is told about every checkpoint that cannot be used, and about copies.
 
     Raises:
-      UserError: `checkpoints` is a link or no folder, or all in it that can be read are
-        of another run: nothing of it is overwritten.
+      UserError: `checkpoints` is a link or no folder; or none in it can be used, and
+        one is of another run: nothing is overwritten then.
     """
     run_folder.check_own(folder / _FOLDER)
     found = sorted((folder / _FOLDER).glob("task-*"), reverse=True)

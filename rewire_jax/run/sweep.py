@@ -25,7 +25,7 @@ import numpy as np
 from rewire_jax.core.arguments import check_whole, require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
-from rewire_jax.core.settings import Settings, validate
+from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.run import header_check, loggers, run_state, sweep_members
 from rewire_jax.run.interrupts import Stopped, interruptible
@@ -45,7 +45,7 @@ from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
 from rewire_jax.training import memory_estimate, population
 from rewire_jax.training.population import Member
-from rewire_jax.training.run_setup import Plan, prepare
+from rewire_jax.training.run_setup import Plan, complete, prepare
 
 _POLL = 1.0  # seconds, to wait for another process
 
@@ -273,7 +273,7 @@ def sweep(
     check_whole("--halving", halving, 1)
     check_whole("--members-per-batch", members_per_batch)
     check_whole("--random", random)
-    validate(settings)
+    _, scenario = complete(settings, scenario)
     loggers.check(log)
     given = {name: read_axis(name, values) for name, values in (axes or {}).items()}
     require(bool(given or configurations), "a sweep needs an axis: --alpha 0 1e-5")
@@ -286,7 +286,12 @@ def sweep(
     settings, members = make_members(settings, configurations)
     plan = prepare(settings, scenario, members[:1])
     header = sweep_members.make_header(
-        plan, members, tuple(configurations[0]), given, random=random, halving=halving
+        plan,
+        members,
+        tuple(configurations[0]),
+        given,
+        random=int(random),
+        halving=int(halving),
     )
     with ExitStack() as stack:
         if not join:

@@ -3,13 +3,12 @@
 import dataclasses
 import itertools
 import math
-import numbers
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rewire_jax.core.arguments import flag, require
+from rewire_jax.core.arguments import flag, is_number, require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import (
     SacSettings,
@@ -38,13 +37,13 @@ def read_axis(name: str, values: Any) -> list[float]:
     Raises:
       UserError: they are not a list of numbers.
     """
-    array = np.asarray(values, dtype=object)
-    numeric = array.ndim == 1 and all(
-        isinstance(x, numbers.Real) and not isinstance(x, bool) for x in array
-    )
-    require(numeric, f"{flag(name)} needs a list of numbers, not {values!r:.80}")
+    several = isinstance(values, Iterable) and not isinstance(values, str)
+    listed = list(values) if several else []
+    real = [x for x in listed if is_number(x) or isinstance(x, float)]
+    fits = several and len(real) == len(listed)
+    require(fits, f"{flag(name)} needs a list of numbers, not {values!r:.80}")
     try:
-        return [float(value) for value in array]
+        return [float(value) for value in listed]
     except OverflowError:
         raise UserError(f"{flag(name)} has a number that is too large") from None
 
@@ -180,9 +179,9 @@ def _check(name: str, value: float, kinds: Mapping[str, type]) -> None:
         f"no sweep over {name!r}: choose among {', '.join(sorted(kinds))}",
     )
     word = flag(name)
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    require(real, f"{word} must be a number, not {value!r:.80}")
-    require(abs(value) < math.inf, f"{word} must be finite, not {value}")
+    known = is_number(value) or isinstance(value, float)
+    require(known, f"{word} must be a number, not {value!r:.80}")
+    require(is_number(value), f"{word} must be finite, not {value}")
     require(
         kinds[name] is not int or value == int(value),
         f"{word} must be a whole number, not {value:g}",

@@ -316,7 +316,7 @@ def check_own(path: Path) -> None:
 
 
 def refuse_link(path: Path) -> None:
-    """Raises `UserError` for a link: nothing outside the folder is written."""
+    """Raises `UserError` for a link of any kind: nothing outside is written."""
     if path.is_symlink():
         raise UserError(f"{path} is a link: replace it by what it names")
     if path.is_file() and path.stat().st_nlink > 1:

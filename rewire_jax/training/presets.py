@@ -75,7 +75,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
       profile: "paper", "authors" or "quick".
 
     Raises:
-      UserError: an unknown method or profile.
+      UserError: an unknown method or profile, or no `Scenario`.
     """
     require(
         isinstance(scenario, Scenario),

@@ -170,14 +170,18 @@ def complete(
         scenario is None or isinstance(scenario, Scenario),
         f"scenario must be a Scenario, see make_scenario, not {scenario!r:.80}",
     )
-    validate(settings)
-    settings = typed_settings(settings)
+    require(
+        isinstance(settings.sac, SacSettings),
+        f"sac must be SacSettings, not {settings.sac!r:.80}",
+    )
     options = find_method(settings.method).settings
     require(
         isinstance(settings.options, options),
         f"--method {settings.method} takes {options.__name__} as options, not "
         f"{type(settings.options).__name__}",
     )
+    validate(settings)
+    settings = typed_settings(settings)
     settings = dataclasses.replace(settings, options=settings.options.checked())
     scenario = scenario or make_scenario(
         settings.scenario, settings.backend, settings.reward
@@ -245,7 +249,8 @@ def _known(own: Any, given: Any, name: str) -> Any:
         value, before = getattr(given, field.name), getattr(own, field.name)
         if field.name not in traced_fields(kind):
             # What `checked` fills in may be as it is by default.
-            same = value is before or value in (before, field.default)
+            filled = field.default == 0 and value == 0
+            same = value is before or value == before or filled
             require(same, f"{flag(field.name)} cannot differ from {before} here")
             continue
         shape = np.shape(value)

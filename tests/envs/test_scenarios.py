@@ -214,7 +214,7 @@ def test_own_scenarios(monkeypatch):
 
 def test_a_domain_of_ones_own(monkeypatch):
     domain = probe.make_domain("match")
-    own_kind = DomainKind(lambda *_: domain, "own")
+    own_kind = DomainKind(lambda *_: probe.make_domain("reach"), "own")
     monkeypatch.setitem(DOMAINS, "mine", own_kind)  # and forgotten again
     register_domain("mine", domain)
     scenario = make_scenario(own(domain="mine"))

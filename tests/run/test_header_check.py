@@ -72,7 +72,9 @@ def test_a_header_as_it_was_written_is_taken(
 ) -> None:
     write_report([trained[kind]], tmp_path / "report")
     # Nothing to compare with.
-    copy = changed(trained[kind], tmp_path / "copy", lambda h: h["settings"].update())
+    copy = changed(
+        trained[kind], tmp_path / "copy", lambda h: h["settings"].update(envs=4)
+    )
     for path in copy.glob("**/checkpoints"):
         shutil.rmtree(path)
     check_header(copy)

@@ -117,6 +117,9 @@ def test_settings(changes: dict[str, Any], said: str, tmp_path: Path) -> None:
     "call",
     [
         lambda: rewire_jax.make_train("settings"),
+        lambda: rewire_jax.make_train(dataclasses.replace(tiny(), options=None)),
+        lambda: rewire_jax.make_train(dataclasses.replace(tiny(), sac=None)),
+        lambda: rewire_jax.sweep("settings", HERE, axes={"alpha": [1]}),
         lambda: rewire_jax.make_train(tiny(), "probe/reach"),
         lambda: rewire_jax.preset("probe/reach", "ft1"),
         lambda: rewire_jax.make_scenario(5),
