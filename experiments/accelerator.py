@@ -38,7 +38,6 @@ from experiments.speed.updates import METHODS, update_loop, updates
 from experiments.suite import Row
 from rewire_jax.core.arguments import require
 from rewire_jax.core.formatting import seconds as seconds_of
-from rewire_jax.core.settings import Settings
 from rewire_jax.envs.base import Environment
 from rewire_jax.storage import run_folder
 from rewire_jax.training.run_setup import prepare
@@ -99,7 +98,7 @@ class Accelerator:
         """Time for a step, or for all."""
         return float("inf") if self.limit is None else seconds_of(self.limit)
 
-    def settings(self, method: str, **sac: Any) -> Settings:
+    def settings(self, method: str, **sac: Any) -> rewire_jax.Settings:
         """The paper's settings of a method, except in a dry run."""
         return self.effort.settings(method, **{} if self.tiny else sac)
 

@@ -35,12 +35,17 @@ def require_weights(group: Any, *names: str) -> None:
         require(fits, f"{flag(name)} must be at least 0 and finite, not {value}")
 
 
-def is_number(value: Any) -> bool:
-    """Whether a value is a single finite number, of Python, NumPy or JAX."""
+def is_real(value: Any) -> bool:
+    """Whether a value is a single real number, of Python, NumPy or JAX."""
     if getattr(value, "shape", None) == () and hasattr(value, "item"):
         value = value.item()
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    return real and abs(value) < math.inf
+    # In Python a bool is an int, too.
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a value is a single real number, neither NaN nor infinite."""
+    return is_real(value) and bool(abs(value) < math.inf)
 
 
 def check_whole(name: str, value: Any, least: int = 0, most: int = MOST) -> None:
@@ -67,16 +72,12 @@ def check_optional(name: str, value: Any, least: int = 0, most: int = MOST) -> N
 
 def check_seconds(name: str, value: Any) -> None:
     """Raises `UserError` unless a value is a finite length of time, or 0."""
-    if not is_number(value) or value < 0:
+    if not is_finite(value) or value < 0:
         raise UserError(f"{name} must be a number of seconds, not {value!r:.80}")
 
 
 def check_name(kind: str, value: Any) -> None:
     """Raises `UserError` unless a value can name something of this kind."""
-    if (
-        not isinstance(value, str)
-        or value != value.strip()
-        or not value.isprintable()
-        or not value
-    ):
+    text = isinstance(value, str) and value.isprintable()
+    if not text or not value or value != value.strip():
         raise UserError(f"a {kind}'s name must be printable text, not {value!r:.80}")

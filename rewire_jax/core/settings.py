@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import jax
 import tyro
 
-from rewire_jax.core.arguments import flag, require
+from rewire_jax.core.arguments import MOST, flag, require
 
 T = TypeVar("T")
 
@@ -225,9 +225,8 @@ _AT_LEAST: dict[str, float] = {
     "l2_init": 0,
     "parseval": 0,
 }
-# Counters and floats have 32 bits. The other limits prevent endless loops, and the
-# memory of all pairs of modes.
-_LARGEST = 2**31
+# Floats have 32 bits. The other limits prevent endless loops, and the memory of all
+# pairs of modes.
 _LARGEST_FLOAT, _SMALLEST_FLOAT = 3.4e38, 1.2e-38
 MOST_SEEDS = 4_096
 MOST_EPISODES = 2**20
@@ -263,7 +262,7 @@ def check_kinds(group: Any) -> None:
             fits = isinstance(value, base) and isinstance(value, bool) == (kind is bool)
             require(fits, f"{flag(name)} must be {noun}, {told}")
             if kind is int:
-                most = _AT_MOST.get(name, _LARGEST - 1)
+                most = _AT_MOST.get(name, MOST)
                 require(value <= most, f"{flag(name)} must be at most {most}, {told}")
             if kind is float:
                 _check_float(flag(name), value)
@@ -311,9 +310,7 @@ def validate(run: Settings) -> None:
             f"{flag(name)} must be at least {least:g}, not {values[name]}",
         )
     last = run.seed + run.seeds - 1
-    require(
-        last < _LARGEST, f"--seed {run.seed}: the last seed would be {last}; lower it"
-    )
+    require(last <= MOST, f"--seed {run.seed}: the last seed would be {last}; lower it")
     for name in _POSITIVE:
         require(values[name] > 0, f"{flag(name)} must be above 0, not {values[name]}")
     for name in _SHARE:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import chex
 import jax
 
-from rewire_jax.core.arguments import check_name, is_number
+from rewire_jax.core.arguments import check_name, is_finite
 from rewire_jax.core.errors import UserError
 from rewire_jax.envs.geom_trajectory import Film
 
@@ -152,7 +152,7 @@ class TaskChange:
             *self.bodies.items(),
             *self.actions.items(),
         ):
-            if not is_number(value):
+            if not is_finite(value):
                 raise UserError(
                     f"{name} of task {self.name!r} must be a finite number, not {value}"
                 )

@@ -175,6 +175,14 @@ def register_scenario(spec: ScenarioSpec) -> None:
     SCENARIOS[spec.name] = spec
 
 
+def check_scenario(scenario: Any) -> None:
+    """Raises `UserError` unless this is a `Scenario`."""
+    if not isinstance(scenario, Scenario):
+        raise UserError(
+            f"scenario must be a Scenario, see make_scenario, not {scenario!r:.80}"
+        )
+
+
 def _check_spec(spec: Any) -> None:
     if not isinstance(spec, ScenarioSpec):
         raise UserError(f"a scenario must be a ScenarioSpec, not {spec!r:.80}")

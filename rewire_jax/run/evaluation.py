@@ -153,9 +153,9 @@ def evaluate(
         f"{folder} holds a sweep: `rewire-jax report {folder}` shows its evaluations, "
         "load_policy gives the policy of a member",
     )
-    _, settings = saved(folder)
+    header, settings = saved(folder)
     plan = prepare(settings)
-    header_check.check_tasks(folder, plan)
+    header_check.check_tasks(folder, header, plan)
     stage = run_state.latest(folder) if stage is None else stage
     policies, active = _policies(folder, stage, plan)
     choice = None

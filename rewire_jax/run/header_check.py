@@ -1,8 +1,9 @@
 """Whether a folder's header is still the one it was trained with."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
@@ -30,27 +31,50 @@ def check_header(folder: Path) -> None:
     header = run_folder.read_header(folder, kind)
     if header["settings"]["method"] not in METHODS:
         return
+
+    @functools.cache  # Read only if there is a checkpoint, and only once.
+    def trained() -> tuple[Settings, Sequence[Member]]:
+        _, settings = run_state.saved(folder, kind)
+        if kind == "run":
+            return settings, population.of_run(settings)
+        return settings, sweep_members.members_of(folder, header, settings)
+
+    for place, numbers in _parts(folder, header, kind):
+        newest = checkpoint.newest_metadata(place / "checkpoints")
+        found = newest.get("identity")
+        if not found:
+            continue
+        settings, members = trained()
+        if numbers is not None:
+            members = [members[number] for number in numbers]
+        if found != run_state.identity(settings, members):
+            raise UserError(
+                f"{folder / run_folder.HEADER} and the newest checkpoint in {place} do "
+                "not belong together: restore the one that has changed"
+            )
+
+
+def _parts(
+    folder: Path, header: Mapping[str, Any], kind: str
+) -> Iterator[tuple[Path, list[int] | None]]:
+    """The folders with checkpoints, and the members of a sweep's batch in each."""
     if kind == "run":
-        _compare(folder, folder, population.of_run)
+        yield folder, None
         return
     with reading(folder / run_folder.HEADER):
         count, tasks = len(header["members"]), len(header["tasks"])
-
-    @functools.cache
-    def every() -> Sequence[Member]:
-        _, settings = run_state.saved(folder, kind)
-        return sweep_members.members_of(folder, header, settings)
-
-    def members(numbers: Sequence[int], _: Settings) -> Sequence[Member]:
-        return [every()[number] for number in numbers]
-
     for _, place, numbers in each_batch(folder, count, tasks):
-        _compare(folder, place, functools.partial(members, numbers))
+        yield place, numbers
 
 
-def check_tasks(folder: Path, plan: Plan, kind: str = "run") -> None:
-    """Raises `UserError` if a folder's run or sweep had other tasks than the plan."""
-    header = run_folder.read_header(folder, kind)
+def check_tasks(folder: Path, header: Mapping[str, Any], plan: Plan) -> None:
+    """Raises `UserError` if a folder's run or sweep had other tasks than the plan.
+
+    Args:
+      folder: the folder.
+      header: its header.
+      plan: what is to be done with it.
+    """
     length = plan.scenario.environment.episode_length
     same = header.get("tasks") == list(plan.names)
     require(
@@ -58,28 +82,3 @@ def check_tasks(folder: Path, plan: Plan, kind: str = "run") -> None:
         f"{folder} was trained on other tasks than {plan.scenario.name} has now: name "
         "another --out, or restore the scenario",
     )
-
-
-def _compare(
-    folder: Path, place: Path, members: Callable[[Settings], Sequence[Member]]
-) -> None:
-    """Compares a header with the newest checkpoint in a folder that can be read.
-
-    Args:
-      folder: folder with the header.
-      place: folder with the checkpoints.
-      members: the members that trained there, by the header's settings.
-    """
-    for path in checkpoint.available(place / "checkpoints"):
-        try:
-            found = checkpoint.read_metadata(path).get("identity", {})
-        except UserError:  # damaged, or just replaced by a run that goes on
-            continue
-        if found:
-            _, settings = run_state.saved(folder, run_folder.kind(folder))
-            if found != run_state.identity(settings, members(settings)):
-                raise UserError(
-                    f"{folder / run_folder.HEADER} and {path} do not belong together: "
-                    "restore the one that has changed"
-                )
-        return

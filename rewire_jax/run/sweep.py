@@ -280,7 +280,6 @@ def sweep(
     every = len(configurations) or random or math.prod(map(len, given.values()))
     plan = prepare(settings, scenario, population.of_run(settings)[:1])
     memory_estimate.check_sweep(plan, every * settings.seeds, folder)
-    scenario = plan.scenario
     if not configurations:
         configurations = draws(given, random, settings) if random else grid(given)
     settings, members = make_members(settings, configurations)
@@ -298,8 +297,8 @@ def sweep(
             start = None if resume else header
             stack.enter_context(run_folder.held(folder, start, "sweep"))
         run_folder.compare(folder, plan.settings, "sweep")
-        header_check.check_tasks(folder, plan, "sweep")
         saved = run_folder.read_header(folder, "sweep")
+        header_check.check_tasks(folder, saved, plan)
         require(
             all(saved[name] == header[name] for name in ("members", "halving")),
             f"{folder} was started with other axes, seeds or halving: repeat them or "

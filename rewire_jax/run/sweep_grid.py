@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rewire_jax.core.arguments import flag, is_number, require
+from rewire_jax.core.arguments import flag, is_finite, is_real, require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import (
     SacSettings,
@@ -39,8 +39,7 @@ def read_axis(name: str, values: Any) -> list[float]:
     """
     several = isinstance(values, Iterable) and not isinstance(values, str)
     listed = list(values) if several else []
-    real = [x for x in listed if is_number(x) or isinstance(x, float)]
-    fits = several and len(real) == len(listed)
+    fits = several and all(map(is_real, listed))
     require(fits, f"{flag(name)} needs a list of numbers, not {values!r:.80}")
     try:
         return [float(value) for value in listed]
@@ -179,9 +178,8 @@ def _check(name: str, value: float, kinds: Mapping[str, type]) -> None:
         f"no sweep over {name!r}: choose among {', '.join(sorted(kinds))}",
     )
     word = flag(name)
-    known = is_number(value) or isinstance(value, float)
-    require(known, f"{word} must be a number, not {value!r:.80}")
-    require(is_number(value), f"{word} must be finite, not {value}")
+    require(is_real(value), f"{word} must be a number, not {value!r:.80}")
+    require(is_finite(value), f"{word} must be finite, not {value}")
     require(
         kinds[name] is not int or value == int(value),
         f"{word} must be a whole number, not {value:g}",

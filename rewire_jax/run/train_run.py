@@ -320,7 +320,7 @@ def train(
         stack.enter_context(run_folder.held(folder, None if resume else header))
         if resume:
             run_folder.compare(folder, plan.settings)
-            header_check.check_tasks(folder, plan)
+            header_check.check_tasks(folder, run_folder.read_header(folder), plan)
         display = stack.enter_context(
             progress(
                 plan.names, plan.interactions, [m.name for m in plan.members], label

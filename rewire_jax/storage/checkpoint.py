@@ -7,6 +7,7 @@ under a temporary name and renamed when it is on disk: give checkpoints names of
 their own, in the order of time. A folder of checkpoints has one writer at a time.
 """
 
+import contextlib
 import errno
 import hashlib
 import itertools
@@ -17,7 +18,6 @@ import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +151,15 @@ def available(folder: Path) -> list[Path]:
     return sorted(found, reverse=True)
 
 
+def newest_metadata(folder: Path) -> dict[str, Any]:
+    """Reads the metadata of the newest checkpoint that can be read; {} without any."""
+    for path in available(folder):
+        # It may be damaged, or just replaced by a run that goes on.
+        with contextlib.suppress(UserError):
+            return read_metadata(path)
+    return {}
+
+
 def remove(paths: Iterable[Path]) -> None:
     """Deletes checkpoints, each out of sight before it is taken apart."""
     for path in paths:
@@ -241,7 +250,7 @@ def _check_sizes(found: Any, like: Any) -> None:
                 raise ValueError(f"array {i} is {have.dtype}{list(have.shape)}")
 
 
-@contextmanager
+@contextlib.contextmanager
 def _orbax() -> Iterator[tuple[Any, Any]]:
     """Orbax, and a synchronous checkpointer that reports only by exceptions."""
     # Here, because it takes long to import.

@@ -93,18 +93,13 @@ def read_header(folder: Path, kind: str) -> Results:
 
 def check_tables(folder: Path) -> None:
     """Raises `UserError` if rows have changed since a run's newest checkpoint."""
-    for path in checkpoint.available(folder / "checkpoints"):
-        try:
-            marks = checkpoint.read_metadata(path).get("tables", {})
-        except UserError:  # damaged, or just replaced by a run that goes on
-            continue
-        changed = run_folder.changed(folder, marks)
-        if changed:
-            raise UserError(
-                f"{changed} has lost or changed rows since it was written: restore it, "
-                "or run the command again with --resume"
-            )
-        return
+    newest = checkpoint.newest_metadata(folder / "checkpoints")
+    changed = run_folder.changed(folder, newest.get("tables", {}))
+    if changed:
+        raise UserError(
+            f"{changed} has lost or changed rows since it was written: restore it, "
+            "or run the command again with --resume"
+        )
 
 
 def check_member(row: Mapping[str, Any], seeds: Mapping[int, int]) -> int:

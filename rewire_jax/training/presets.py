@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 from rewire_jax.core.arguments import require
 from rewire_jax.core.settings import SacSettings, Settings
-from rewire_jax.envs.scenarios import SCENARIOS, Scenario
+from rewire_jax.envs.scenarios import SCENARIOS, Scenario, check_scenario
 from rewire_jax.methods import find_method
 
 Profile = Literal["paper", "authors", "quick"]
@@ -77,10 +77,7 @@ def preset(scenario: Scenario, method: str, profile: str = "paper") -> Settings:
     Raises:
       UserError: an unknown method or profile, or no `Scenario`.
     """
-    require(
-        isinstance(scenario, Scenario),
-        f"scenario must be a Scenario, see make_scenario, not {scenario!r:.80}",
-    )
+    check_scenario(scenario)
     profiles = get_args(Profile)
     require(
         profile in profiles,

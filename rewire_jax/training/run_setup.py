@@ -21,7 +21,7 @@ from rewire_jax.core.settings import (
     with_traced,
 )
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
-from rewire_jax.envs.scenarios import Scenario, make_scenario
+from rewire_jax.envs.scenarios import Scenario, check_scenario, make_scenario
 from rewire_jax.methods import find_method
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
@@ -167,10 +167,6 @@ def complete(
         f"settings must be Settings, such as preset gives, not {settings!r:.80}",
     )
     require(
-        scenario is None or isinstance(scenario, Scenario),
-        f"scenario must be a Scenario, see make_scenario, not {scenario!r:.80}",
-    )
-    require(
         isinstance(settings.sac, SacSettings),
         f"sac must be SacSettings, not {settings.sac!r:.80}",
     )
@@ -183,9 +179,9 @@ def complete(
     validate(settings)
     settings = typed_settings(settings)
     settings = dataclasses.replace(settings, options=settings.options.checked())
-    scenario = scenario or make_scenario(
-        settings.scenario, settings.backend, settings.reward
-    )
+    if scenario is None:
+        scenario = make_scenario(settings.scenario, settings.backend, settings.reward)
+    check_scenario(scenario)
     for name, made in (("scenario", scenario.name), ("backend", scenario.backend)):
         given = getattr(settings, name)
         require(given == made, f"{flag(name)} {given}: the run is on {made}; drop it")
@@ -248,9 +244,9 @@ def _known(own: Any, given: Any, name: str) -> Any:
     for field in dataclasses.fields(kind):
         value, before = getattr(given, field.name), getattr(own, field.name)
         if field.name not in traced_fields(kind):
-            # What `checked` fills in may be as it is by default.
-            filled = field.default == 0 and value == 0
-            same = value is before or value == before or filled
+            # Zero is what `checked` fills in.
+            fixed = not isinstance(value, jax.core.Tracer)
+            same = fixed and (value == before or value == field.default == 0)
             require(same, f"{flag(field.name)} cannot differ from {before} here")
             continue
         shape = np.shape(value)

@@ -179,25 +179,28 @@ def test_rows_that_are_lost_or_others_are_noticed(tmp_path: Path, text: str) -> 
     assert noticed == (len(text) < 18)
 
 
-def test_a_header_is_not_written_through_a_link(tmp_path):
-    outside = tmp_path / "outside"
-    outside.write_text("precious")
+@pytest.fixture
+def outside(tmp_path):
+    """A file outside of the folder `run`."""
+    (tmp_path / "run").mkdir()
+    path = tmp_path / "outside"
+    path.write_text("precious")
+    return path
+
+
+def test_a_header_is_not_written_through_a_link(tmp_path, outside):
     folder = tmp_path / "run"
-    folder.mkdir()
     (folder / ".settings.json").symlink_to(outside)
     run_folder.write(folder / "settings.json", {"a": 1})
     assert outside.read_text() == "precious"
     assert not (folder / "settings.json").is_symlink()
 
 
-def test_a_table_with_another_name_elsewhere_is_not_written(tmp_path):
-    outside = tmp_path / "outside"
-    outside.write_text("{}\n")
+def test_a_table_with_another_name_elsewhere_is_not_written(tmp_path, outside):
     folder = tmp_path / "run"
-    folder.mkdir()
     (folder / "results.jsonl").hardlink_to(outside)
     with pytest.raises(UserError, match="results"):
         run_folder.append(folder, "results.jsonl", [{"a": 1}])
     with pytest.raises(UserError, match="results"):
         run_folder.cut(folder, {})
-    assert outside.read_text() == "{}\n"
+    assert outside.read_text() == "precious"

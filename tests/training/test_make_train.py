@@ -187,3 +187,15 @@ def test_traced_values_must_be_single_numbers(value: jax.Array) -> None:
 
     with pytest.raises(UserError, match="--reward-scale"):
         jax.eval_shape(at, value)
+
+
+def test_a_static_value_cannot_be_traced() -> None:
+    settings = small("ft1")
+    train = make_train(settings)
+
+    def at(size: jax.Array) -> Any:
+        sac = dataclasses.replace(settings.sac, batch_size=size)
+        return train(jax.random.key(0), sac=sac)
+
+    with pytest.raises(UserError, match="--batch-size"):
+        jax.eval_shape(at, jnp.asarray(settings.sac.batch_size))
