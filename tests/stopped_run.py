@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rewire_jax.core.settings import Settings
-from rewire_jax.run import run_state, train_run
+from rewire_jax.run import run_checkpoints, train_run
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
 
@@ -49,7 +49,7 @@ def _leaves(folder: Path, settings: Settings) -> list[np.ndarray]:
     prepared = run_setup.prepare(settings)
     learner = jax.eval_shape(prepared.program.init, prepared.stacked)
     like = {"policy": (learner.params, learner.method_state), "critic": learner.critic}
-    items, _ = checkpoint.load(run_state.kept(folder, None), like)
+    items, _ = checkpoint.load(run_checkpoints.kept(folder, None), like)
     return jax.tree.leaves(items)
 
 

@@ -19,6 +19,8 @@ CriticEntropy = Literal["sample", "batch_mean"]
 """The entropy in a critic's target: of each action, or the mean over the batch."""
 PolicyStates = Literal["current", "both"]
 """States in the policy's losses: the first of each transition, or both."""
+Boundaries = Literal["given", "detected"]
+"""Whether the learner is told when the task changes, or has to notice it."""
 Network = Literal["mlp", "layer_norm", "residual"]
 """Networks of policy and critics: plain, with normalised hidden layers, or residual."""
 
@@ -169,6 +171,12 @@ class Settings:
         policies by their return; they count as interactions.
       report_every: interactions between two progress reports.
       checkpoint_every: interactions between two full checkpoints, 0 for none.
+      boundaries: "given" tells the learner when the task changes; "detected" does not:
+        it starts a new task when a model of the environment, checked at each progress
+        report, no longer predicts what happens.
+      detection_threshold: with `boundaries` "detected", how many times the usual
+        spread the model's error must leave its latest values; larger numbers give fewer
+        false alarms and miss more changes.
       sac: Soft Actor-Critic's settings.
       options: the method's own settings.
     """
@@ -194,6 +202,8 @@ class Settings:
     selection_episodes: int = 32
     report_every: int = 20_000
     checkpoint_every: int = 250_000
+    boundaries: Boundaries = "given"
+    detection_threshold: float = 4.0
     sac: SacSettings
     options: Any
 
@@ -212,6 +222,7 @@ _AT_LEAST: dict[str, float] = {
     "selection_episodes": 0,
     "report_every": 1,
     "checkpoint_every": 0,
+    "detection_threshold": 0,
     "reward_scale": 0,
     "target_multiplier": 0,
     "hidden": 1,

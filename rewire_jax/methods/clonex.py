@@ -100,7 +100,7 @@ class State(NamedTuple):
 def clonex(spec: Spec, options: ClonexSettings) -> Method:
     """All tasks train the same hidden layers; cloning keeps the earlier policies."""
     act = networks.policy_of(spec.network)
-    slots = min(options.head_slots, spec.tasks)
+    slots = spec.slots(options.head_slots)
 
     def layers(params, slot):
         return [*params.hidden, at(params.heads, slot)]

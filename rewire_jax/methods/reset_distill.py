@@ -83,7 +83,7 @@ def reset_distill(spec: Spec, options: ResetDistillSettings) -> Method:
     """The parameters are the online policy, the state holds the offline one."""
     plain = ft1(spec, FinetuneSettings())
     act = plain.act
-    slots = min(options.head_slots, spec.tasks)
+    slots = spec.slots(options.head_slots)
     adam = optax.adam(options.distill_rate)
 
     def layers(offline, slot):

@@ -36,7 +36,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
         "--network residual: its neurons have fixed places, so wirings cannot be "
         "refined; add --alignment off",
     )
-    slots = min(options.head_slots, spec.tasks)
+    slots = spec.slots(options.head_slots)
     design = Design(
         spec=spec,
         options=options,

@@ -18,6 +18,8 @@ class Spec(NamedTuple):
         network; `networks.ACTIVATIONS` what is between two layers, for
         `networks.between`.
       updates: SAC updates in a task.
+      segments: largest number of segments, if the method is not told the tasks, see
+        `--boundaries`; else 0. A method is then made with `tasks` of this number.
     """
 
     observations: int
@@ -27,6 +29,14 @@ class Spec(NamedTuple):
     tasks: int
     network: Network = "mlp"
     updates: int = 1
+    segments: int = 0
+
+    def slots(self, most: int) -> int:
+        """Slots for tasks of which the same recur after `most` places, if at all.
+
+        Which segments are the same task is unknown: each of them has a slot.
+        """
+        return self.tasks if self.segments else min(most, self.tasks)
 
     def sizes(self, width: int = 0) -> list[int]:
         """Layer sizes of a plain policy, one MLP; `width` 0 means `hidden` neurons."""

@@ -12,9 +12,9 @@ from rewire_jax.core.errors import UserError, writing
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.geom_trajectory import Film
 from rewire_jax.envs.scenarios import Scenario, make_scenario
-from rewire_jax.run import run_state, sweep_members
+from rewire_jax.run import run_checkpoints, sweep_members
 from rewire_jax.run.policies import PolicyFunction, load_policy
-from rewire_jax.run.run_state import saved
+from rewire_jax.run.run_checkpoints import saved
 from rewire_jax.storage import checkpoint, run_folder
 
 
@@ -130,7 +130,7 @@ def _learned(folder: Path, member: int | None) -> int:
     """Number of tasks that the latest policy has learned."""
     if member is not None:
         folder = sweep_members.find(folder, member, None).folder
-    return checkpoint.read_metadata(run_state.kept(folder, None))["stage"]
+    return checkpoint.read_metadata(run_checkpoints.kept(folder, None))["stage"]
 
 
 def _play(scenario: Scenario, task: Task, act: PolicyFunction, episode: int) -> _Played:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rewire_jax.reports import run_tables
+from rewire_jax.reports import noticed_changes, run_tables
 from rewire_jax.reports.data_files import json_text
 from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.report import Report
@@ -54,7 +54,8 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
     """
     title, notes = _title(comparison), tuple(_notes(comparison))
     results, costs = run_tables.results(comparison), run_tables.costs(comparison)
-    tasks = run_tables.tasks(comparison)
+    tasks, changes = run_tables.tasks(comparison), noticed_changes.table(comparison)
+    found = [changes] if changes.rows else []
     rows = [[*r, *c[1:]] for r, c in zip(results.rows, costs.rows, strict=True)]
     return Report(
         folder=folder,
@@ -64,7 +65,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
         numbers=comparison,
         table=Table([*results.heads, *costs.heads[1:]], rows),
         # A terminal is too narrow for all columns side by side.
-        shown=(tasks, costs, results),
+        shown=(*found, tasks, costs, results),
         reading=tuple(_reading(comparison)),
         texts={
             "report.csv": run_tables.results_csv(comparison),
@@ -77,7 +78,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
             "matrix.png": "Matrix",
         },
         draw=partial(_draw, comparison, title),
-        details=to_markdown(*tasks),
+        details=[line for each in (tasks, *found) for line in to_markdown(*each)],
         origins=[
             *(origin(each.label, each.run) for each in comparison.summaries),
             *(origin(f"{run.tasks[0]} alone", run) for run in comparison.single),
@@ -96,6 +97,8 @@ def _reading(comparison: Comparison) -> Iterator[str]:
         yield _NORMALISED
     if comparison.single:
         yield _TRANSFER
+    if any(summary.run.segments for summary in comparison.summaries):
+        yield noticed_changes.READING
     for made in dict.fromkeys(source.made for source in comparison.sources):
         yield f"The paper's columns are its published results, {made}."
 
@@ -161,6 +164,7 @@ def _json(comparison: Comparison, title: str, notes: tuple[str, ...]) -> str:
             "tasks": _tasks_json(summary.run, summary.tasks),
             "scores": summary.run.scores[summary.run.kept].tolist(),
             **_others_json(summary),
+            **noticed_changes.to_json(summary.run),
             "performance": asdict(summary.performance),
             "iqm": asdict(summary.iqm),
             "mean_forgetting": asdict(summary.forgetting),

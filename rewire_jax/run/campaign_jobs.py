@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rewire_jax.core import compilation_cache
 from rewire_jax.core.errors import UserError, writing
-from rewire_jax.run import run_state
+from rewire_jax.run import run_checkpoints
 from rewire_jax.run.campaign_file import Campaign, PlannedRun
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import document, reading, text
@@ -60,7 +60,7 @@ class Job:
     def done(self) -> bool:
         """Whether the run is finished; then its checkpoints may be deleted."""
         if self.started and (self.folder / "checkpoints").exists():
-            return run_state.finished(self.folder, self.run.settings.tasks - 1)
+            return run_checkpoints.finished(self.folder, self.run.settings.tasks - 1)
         try:
             return self.started and read_run(self.folder).complete
         except UserError:

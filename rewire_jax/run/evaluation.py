@@ -14,8 +14,8 @@ from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection
 from rewire_jax.methods.spec import Spec
-from rewire_jax.run import episode_parts, header_check, run_state, task_choice
-from rewire_jax.run.run_state import saved
+from rewire_jax.run import episode_parts, header_check, run_checkpoints, task_choice
+from rewire_jax.run.run_checkpoints import saved
 from rewire_jax.run.task_choice import Choice, Trials
 from rewire_jax.storage import run_folder
 from rewire_jax.training import rollout
@@ -156,7 +156,7 @@ def evaluate(
     header, settings = saved(folder)
     plan = prepare(settings)
     header_check.check_tasks(folder, header, plan)
-    stage = run_state.latest(folder) if stage is None else stage
+    stage = run_checkpoints.latest(folder) if stage is None else stage
     policies, active = _policies(folder, stage, plan)
     choice = None
     if task_label == "none":
@@ -186,8 +186,8 @@ def _policies(folder: Path, stage: int, plan: Plan) -> tuple[Any, np.ndarray]:
     """Policies `[members, tasks]` after a stage; and which members did not diverge."""
     learner = jax.eval_shape(plan.program.init, plan.stacked)
     like = learner.params, learner.method_state
-    owner = run_state.identity(plan.settings, plan.members)
-    learned, active = run_state.read_policies(folder, stage, like, owner)
+    owner = run_checkpoints.identity(plan.settings, plan.members)
+    learned, active = run_checkpoints.read_policies(folder, stage, like, owner)
     learner = plan.program.init(plan.stacked).with_learned(learned)
     return plan.program.policies(plan.stacked, learner), active
 

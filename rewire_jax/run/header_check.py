@@ -9,7 +9,7 @@ from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.methods import METHODS
-from rewire_jax.run import run_state, sweep_members
+from rewire_jax.run import run_checkpoints, sweep_members
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.json_lines import reading
 from rewire_jax.storage.sweep_results import each_batch
@@ -34,7 +34,7 @@ def check_header(folder: Path) -> None:
 
     @functools.cache  # Read only if there is a checkpoint, and only once.
     def trained() -> tuple[Settings, Sequence[Member]]:
-        _, settings = run_state.saved(folder, kind)
+        _, settings = run_checkpoints.saved(folder, kind)
         if kind == "run":
             return settings, population.of_run(settings)
         return settings, sweep_members.members_of(folder, header, settings)
@@ -47,7 +47,7 @@ def check_header(folder: Path) -> None:
         settings, members = trained()
         if numbers is not None:
             members = [members[number] for number in numbers]
-        if found != run_state.identity(settings, members):
+        if found != run_checkpoints.identity(settings, members):
             raise UserError(
                 f"{folder / run_folder.HEADER} and the newest checkpoint in {place} do "
                 "not belong together: restore the one that has changed"

@@ -12,12 +12,12 @@ import numpy as np
 from rewire_jax.core.arguments import check_optional, check_whole, require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
-from rewire_jax.methods import find_method
+from rewire_jax.methods import find_method, segments
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
-from rewire_jax.run import halving, run_state, sweep_members
+from rewire_jax.run import halving, run_checkpoints, sweep_members
 from rewire_jax.run.halving import Array
-from rewire_jax.run.run_state import saved
+from rewire_jax.run.run_checkpoints import saved
 from rewire_jax.run.sweep_members import Found
 from rewire_jax.storage import fields, run_folder
 from rewire_jax.storage.json_lines import reading
@@ -135,13 +135,13 @@ def load_policy(
             raise UserError(f"{folder} has no member {member}: see members.csv there")
         found = sweep_members.find(folder, member, stage)
         members = sweep_members.members_of(folder, header, settings)
-        owner = run_state.identity(settings, [members[n] for n in found.members])
+        owner = run_checkpoints.identity(settings, [members[n] for n in found.members])
         options = members[member].options
     else:
         if member is not None:
             raise UserError(f"{folder} holds a run: give seed, not member")
         seed = settings.seed if seed is None else seed
-        owner = run_state.identity(settings, population.of_run(settings))
+        owner = run_checkpoints.identity(settings, population.of_run(settings))
         options = settings.options
         place = seed - settings.seed
         found = Found(folder, stage, place, settings.seeds, ())
@@ -149,7 +149,7 @@ def load_policy(
             raise UserError(
                 f"{folder} has no seed {seed}: see {run_folder.HEADER} there"
             )
-    method = find_method(settings.method).make(spec, options)
+    method = segments.build(find_method(settings.method).make, spec, options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method, owner))
     policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
     return functools.partial(mean_action, method, spec, policy)
@@ -173,15 +173,16 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
         "the policies of one",
     )
     header, settings, spec = _read(folder, "run")
-    method = find_method(settings.method).make(spec, settings.options)
-    stage = run_state.latest(folder) if stage is None else stage
+    make = find_method(settings.method).make
+    method = segments.build(make, spec, settings.options)
+    stage = run_checkpoints.latest(folder) if stage is None else stage
 
     def candidates(member: Learned) -> tuple[int, ...]:
         trained = [method.policy(*member, jnp.asarray(t)) for t in range(stage + 1)]
         return tuple(sorted(set(halving.first_equal(trained))))
 
     members = population.of_run(settings)
-    owner = run_state.identity(settings, members)
+    owner = run_checkpoints.identity(settings, members)
     learned = _load(Found(folder, stage, 0, settings.seeds, ()), method, owner)
     seeds = tuple(member.seed for member in members)
     act = act_function(method, spec)
@@ -201,5 +202,5 @@ def _load(found: Found, method: Method, owner: Mapping[str, Any]) -> Learned:
     """What the members that trained together have learned, `[num_slots]`."""
     keys = jax.vmap(jax.random.key)(jnp.arange(found.num_slots))
     like = jax.eval_shape(jax.vmap(method.init), keys)
-    learned, _ = run_state.read_policies(found.folder, found.stage, like, owner)
+    learned, _ = run_checkpoints.read_policies(found.folder, found.stage, like, owner)
     return Learned(*jax.tree.map(jnp.asarray, learned))

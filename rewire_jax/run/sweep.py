@@ -27,11 +27,18 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.formatting import short
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import Scenario
-from rewire_jax.run import header_check, loggers, run_state, sweep_members
+from rewire_jax.run import (
+    header_check,
+    loggers,
+    run_checkpoints,
+    run_state,
+    sweep_members,
+)
 from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
 from rewire_jax.run.progress import Progress
 from rewire_jax.run.ranking import rank
+from rewire_jax.run.run_loop import Run
 from rewire_jax.run.run_state import RunState
 from rewire_jax.run.sweep_grid import (
     draws,
@@ -40,7 +47,6 @@ from rewire_jax.run.sweep_grid import (
     read,
     read_axis,
 )
-from rewire_jax.run.train_run import Run
 from rewire_jax.storage import checkpoint, run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of, read_batches, read_sweep
 from rewire_jax.training import memory_estimate, population
@@ -138,7 +144,9 @@ class Sweep:
     def unfinished(self, stage: int, batches: int) -> list[int]:
         """Returns the batches of a task that are not finished."""
         folders = [batch(self.folder, stage, number) for number in range(batches)]
-        return [n for n, f in enumerate(folders) if not run_state.finished(f, stage)]
+        return [
+            n for n, f in enumerate(folders) if not run_checkpoints.finished(f, stage)
+        ]
 
     def claim(
         self, stage: int, number: int, batches: list[list[int]], num_slots: int
@@ -146,7 +154,7 @@ class Sweep:
         """Trains a batch on a task unless another process does; returns whether."""
         folder = batch(self.folder, stage, number)
         with run_folder.claimed(folder) as ours:
-            if ours and not run_state.finished(folder, stage):
+            if ours and not run_checkpoints.finished(folder, stage):
                 self.train(stage, number, batches, num_slots)
         return ours
 
@@ -174,7 +182,7 @@ class Sweep:
             run = Run(plan, folder, display, logs, choosing=True)
 
             def start() -> RunState:
-                now = run_state.restore(folder, plan, display.message)
+                now = run_checkpoints.restore(folder, plan, display.message)
                 if now is None and stage:
                     now = self.gather(stage, plan)
                 return run.start(now)
@@ -210,7 +218,7 @@ class Sweep:
             folder = batch(self.folder, stage - 1, number)
             try:
                 made = self.plan(numbers, num_slots)
-                items = run_state.read_kept(folder, stage - 1, made)
+                items = run_checkpoints.read_kept(folder, stage - 1, made)
             except checkpoint.CheckpointError as error:
                 raise UserError(
                     f"{error}; delete {folder} and resume to train this batch again"
@@ -274,6 +282,11 @@ def sweep(
     check_whole("--members-per-batch", members_per_batch)
     check_whole("--random", random)
     _, scenario = complete(settings, scenario)
+    require(
+        settings.boundaries == "given",
+        "--boundaries detected: members would notice changes at different times; train "
+        "them one by one, with rewire-jax train",
+    )
     loggers.check(log)
     given = {name: read_axis(name, values) for name, values in (axes or {}).items()}
     require(bool(given or configurations), "a sweep needs an axis: --alpha 0 1e-5")

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.settings_json import to_json
-from rewire_jax.run import run_state
+from rewire_jax.run import run_checkpoints
 from rewire_jax.run.sweep_grid import describe, make_members, values_of
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import reading
@@ -46,7 +46,7 @@ def find(folder: Path, member: int, stage: int | None) -> Found:
         batches, num_slots = read_batches(batches_of(folder, each))
         for number, members in enumerate(batches):
             inside = batch(folder, each, number)
-            if member in members and run_state.finished(inside, each):
+            if member in members and run_checkpoints.finished(inside, each):
                 place = members.index(member)
                 return Found(inside, each, place, num_slots, tuple(members))
     when = "any task" if stage is None else f"task {stage}"

@@ -39,7 +39,8 @@ def merged(runs: Sequence[RunData]) -> RunData:
         stored_states=max(run.stored_states for run in runs),
         training=max(run.training for run in runs),
         selection=max(run.selection for run in runs),
-        curve=tuple(_curve(runs, stage) for stage in range(len(first.tasks))),
+        curve=_curves(runs, [run.curve for run in runs]),
+        segments=_curves(runs, [run.segments for run in runs]),
         hours=sum(run.hours for run in runs),
         rate=None,
         memory={where: max(most)} if where else {},
@@ -62,10 +63,20 @@ def merged_curve(parts: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     return np.array(sorted(shared), np.float64), np.concatenate(values)
 
 
-def _curve(runs: Sequence[RunData], stage: int) -> tuple[Array, Array]:
+def _curves(
+    runs: Sequence[RunData], curves: Sequence[tuple[tuple[Array, Array], ...]]
+) -> tuple[tuple[Array, Array], ...]:
+    """Curves `[stages]` of all runs as one."""
+    return tuple(_curve(runs, stage) for stage in zip(*curves, strict=True))
+
+
+def _curve(
+    runs: Sequence[RunData], curves: Sequence[tuple[Array, Array]]
+) -> tuple[Array, Array]:
     """Curve of a stage; NaN for diverged seeds, whose reports end early."""
     kept = np.concatenate([run.kept for run in runs])
-    parts = [(run.curve[stage], run.kept) for run in runs if run.kept.any()]
+    pairs = zip(runs, curves, strict=True)
+    parts = [(curve, run.kept) for run, curve in pairs if run.kept.any()]
     if not parts:
         return np.zeros(0), np.zeros((len(kept), 0))
     x, values = merged_curve([(x, values[rows]) for (x, values), rows in parts])

@@ -43,6 +43,8 @@ class RunData(Results):
         curve: per stage, interactions within the task `[points]` and the score of
             training, `[S, points]`, NaN where missing; the return is what the reward
             a step makes in a whole episode.
+        segments: with `--boundaries detected`, the number of the segment in the shape
+            of `curve`; else empty.
         hours, rate, memory: of all seeds together, see `Timing`.
     """
 
@@ -56,6 +58,7 @@ class RunData(Results):
     training: int
     selection: int
     curve: tuple[tuple[Array, Array], ...]
+    segments: tuple[tuple[Array, Array], ...]
     hours: float
     rate: float | None
     memory: dict[str, int]
@@ -107,6 +110,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
     diverged = (values["diverged"] == 1).any(axis=(1, 2))
     trained = _curve(head, seeds, finished > 0, score.training)
     steps = head.episode_length if score.stepwise else 1
+    detected = head.settings.get("boundaries") == "detected"
     path = folder / "timing.jsonl"
     timing = read_timing(path, range(tasks), len(seeds), finished > 0)
     return RunData(
@@ -122,6 +126,7 @@ def read_run(folder: str | Path, success: Success = "any") -> RunData:
         training=int(np.nanmax(values["training"])),
         selection=int(np.nanmax(values["selection"])),
         curve=tuple((x, values * steps) for x, values in trained),
+        segments=_curve(head, seeds, finished > 0, "segment") if detected else (),
         **timing._asdict(),
     )
 

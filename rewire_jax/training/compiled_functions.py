@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 from rewire_jax.core import kept_programs
 from rewire_jax.core.arguments import require
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
+from rewire_jax.methods import segments
 from rewire_jax.methods.base import Candidates, CandidateScore, Method
 from rewire_jax.training import host_train_loop, population, rollout, sac
 from rewire_jax.training.loop_state import ChunkMetrics, RunnerState
@@ -24,6 +25,10 @@ class Program(NamedTuple):
     Attributes:
       init: `members -> TrainState`.
       begin: `(members, learner, active, index, task) -> RunnerState`, a task's start.
+      start: `(members, learner, active, index, episodes) -> RunnerState`, the same in
+        running environments `[members, envs]`.
+      change_task: `(members, state, number, time, task) -> state`, changes the task of
+        the environments alone; the given state is used up.
       after_baseline: `(members, state, before) -> state`, after the candidates' rollout
         at a task's start; the given state is used up; or None.
       chunk: `(members, state, index, task, time, steps) -> state, ChunkMetrics`, takes
@@ -47,6 +52,8 @@ class Program(NamedTuple):
 
     init: Callable[..., sac.TrainState]
     begin: Callable[..., RunnerState]
+    start: Callable[..., RunnerState]
+    change_task: Callable[..., RunnerState]
     after_baseline: Callable[..., RunnerState] | None
     chunk: Callable[..., tuple[RunnerState, ChunkMetrics]]
     consolidate: Callable[..., sac.TrainState] | None
@@ -96,13 +103,15 @@ def build(of: MemberFunctions, example: Any, mesh: Mesh) -> Program:
       example: one member's method settings, for what is static about the method.
       mesh: the devices among which the members are shared out.
     """
-    method = of.make(of.spec, example)
+    method = segments.build(of.make, of.spec, example)
     traces = population.Traces()
     name = _name(of, example)
     loop, trial = _loop(of, method, mesh, traces, name)
     over = functools.partial(_over, mesh, name)
     return Program(
         init=over(of.init, 0),
+        start=over(of.start, 0, 0, 0, None, 0),
+        change_task=over(of.change_task, 0, 0, None, None, None, donate=(1,)),
         after_baseline=over(of.after_baseline, 0, 0, 0, donate=(1,))
         if method.after_baseline
         else None,

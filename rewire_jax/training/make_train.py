@@ -16,20 +16,21 @@ from rewire_jax.core.arguments import require
 from rewire_jax.core.settings import SacSettings, Settings
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.envs.scenarios import Scenario
-from rewire_jax.methods import find_method
+from rewire_jax.methods import find_method, segments
 from rewire_jax.methods.base import Method, Selection
 from rewire_jax.training import random_keys, rollout, selection
 from rewire_jax.training.acting import Act, Learned, act_function
+from rewire_jax.training.given_values import with_values
 from rewire_jax.training.loop_state import ChunkMetrics
 from rewire_jax.training.member_functions import MemberFunctions
 from rewire_jax.training.population import Members
 from rewire_jax.training.random_keys import Stream
 from rewire_jax.training.run_setup import (
     Budget,
+    chunk_steps,
     complete,
     make_budget,
     make_functions,
-    with_values,
 )
 from rewire_jax.training.sac import TrainState
 
@@ -124,6 +125,11 @@ def make_train(settings: Settings, scenario: Scenario | None = None) -> Train:
         f"{scenario.name} on {scenario.backend} is stepped on the host and cannot be "
         "compiled: use train, which writes a folder",
     )
+    require(
+        settings.boundaries == "given",
+        "--boundaries detected: the host decides when a task begins; use train, which "
+        "writes a folder",
+    )
     functions = make_functions(settings, scenario)
     sequence = [task.data for task in scenario.tasks[: settings.tasks]]
     tasks = jax.tree.map(lambda *leaves: jnp.stack(leaves), *sequence)
@@ -158,7 +164,8 @@ def make_act(settings: Settings, scenario: Scenario | None = None) -> Act:
     """
     settings, scenario = complete(settings, scenario)
     spec = make_functions(settings, scenario).spec
-    method = find_method(settings.method).make(spec, settings.options)
+    make = find_method(settings.method).make
+    method = segments.build(make, spec, settings.options)
     return act_function(method, spec)
 
 
@@ -219,9 +226,8 @@ class _Training:
             before, spent = self.select(state.learner, index, task, 0, spent)
         if self.method.after_baseline and before is not None:
             state = functions.after_baseline(member, state, before)
-        steps, unit = self.budget.steps, self.settings.update_every
-        every = self.settings.report_every // (self.settings.envs * unit)
-        every = max(every, 1) * unit
+        steps = self.budget.steps
+        every = chunk_steps(self.settings)
 
         def chunk(state, done):
             due = jnp.minimum(every, steps - done)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
+from rewire_jax.methods import segments
 from rewire_jax.methods.base import Candidates, Method, Selection, Tools
 from rewire_jax.methods.shared import axes
 from rewire_jax.methods.spec import Spec
@@ -20,7 +21,7 @@ from rewire_jax.training.loop_state import (
     RunnerState,
 )
 from rewire_jax.training.population import Members
-from rewire_jax.training.random_keys import StartKeys, TaskKeys
+from rewire_jax.training.random_keys import StartKeys, Stream, TaskKeys
 from rewire_jax.training.sac import TrainState
 
 
@@ -45,7 +46,7 @@ class MemberFunctions:
 
     def method(self, member: Members) -> Method:
         """Returns the member's method."""
-        return self.make(self.spec, member.options)
+        return segments.build(self.make, self.spec, member.options)
 
     def keys(self, member: Members, index: jax.Array) -> TaskKeys:
         """Returns the member's keys for a task."""
@@ -83,7 +84,7 @@ class MemberFunctions:
         index: jax.Array,
         episodes: rollout.Episode,
     ) -> RunnerState:
-        """Starts a task with environments `[envs]` that were reset for it."""
+        """Starts a task with environments `[envs]`, just reset or already running."""
         method, keys = self.method(member), self.start_keys(member, index)
         params, method_state = method.start_task(
             keys.method, learner.params, learner.method_state, index
@@ -104,6 +105,38 @@ class MemberFunctions:
         acting = (params, method_state) if self.config.overlap else ()
         collection = CollectorState(buffer, episodes, extras)
         return RunnerState(learner, collection, active, acting)
+
+    def change_task(
+        self,
+        member: Members,
+        state: RunnerState,
+        number: jax.Array,
+        time: jax.Array,
+        task: Task,
+    ) -> RunnerState:
+        """Changes the task of the environments, of which the learner is not told.
+
+        Episodes that are to begin are reset for the new task; others go on in it.
+
+        Args:
+          member: the member.
+          state: the member's state.
+          number: `[]` int, how many tasks there were before.
+          time: `[]` int, vector steps stored in the buffer.
+          task: the new task.
+        """
+        environment = self.environment
+        assert isinstance(environment, Environment)
+        keys = random_keys.of_rollout(
+            member.keys, Stream.CHANGE, number, self.config.envs
+        )
+        fresh = jax.vmap(lambda key: rollout.begin(environment, task, key))(keys)
+        buffer, running, extras = state.collection
+        running = running._replace(start=fresh.start)
+        begins = running.steps == 0
+        episodes = jax.vmap(train_loop.select)(begins, fresh, running)
+        buffer = replay_buffer.restart(buffer, time, episodes.state.observation)
+        return state._replace(collection=CollectorState(buffer, episodes, extras))
 
     def after_baseline(
         self, member: Members, state: RunnerState, before: jax.Array

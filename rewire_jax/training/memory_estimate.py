@@ -23,7 +23,7 @@ from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.machine_memory import machine_bytes
 from rewire_jax.envs.base import HostEnvironment
-from rewire_jax.methods import find_method
+from rewire_jax.methods import find_method, segments
 from rewire_jax.methods.shared import map_own
 from rewire_jax.training import colored_noise, rollout, train_loop
 from rewire_jax.training.run_setup import Plan
@@ -147,7 +147,7 @@ def _play(plan: Plan, policies: Any, rows: int, episodes: int) -> int:
     if isinstance(environment, HostEnvironment):
         return size(policies)  # episodes take nothing of the device
     make = find_method(plan.settings.method).make
-    act = make(plan.spec, plan.settings.options).act
+    act = segments.build(make, plan.spec, plan.settings.options).act
 
     def roll(tasks, policies, keys):
         return rollout.episodes(environment, act, tasks, policies, keys, episodes)
@@ -171,7 +171,7 @@ def need(plan: Plan) -> Need:
             True,
             updates=settings.updates,
             environment=environment,
-            method=make(spec, member.options),
+            method=segments.build(make, spec, member.options),
             settings=member.sac,
         )
 

@@ -21,6 +21,7 @@ class Stream(IntEnum):
     EVALUATION = 2
     SELECTION = 3
     CHOICE = 4
+    CHANGE = 5
 
 
 class TaskKeys(NamedTuple):

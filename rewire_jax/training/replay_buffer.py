@@ -124,6 +124,18 @@ def add(
     )
 
 
+def restart(replay: Replay, time: jax.Array, first: jax.Array) -> Replay:
+    """Replaces the observations from which the next step starts.
+
+    Args:
+      replay: the buffer.
+      time: `[]` int, time steps stored so far.
+      first: `[envs, observations]`; the same as before in running episodes.
+    """
+    row = time % len(replay.reward)
+    return replay._replace(observation=replay.observation.at[row].set(first))
+
+
 def sample_indices(
     replay: Replay, key: jax.Array, time: jax.Array, shape: tuple[int, ...]
 ) -> jax.Array:

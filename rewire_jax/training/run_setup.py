@@ -2,30 +2,26 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
 from rewire_jax.core.arguments import flag, require
-from rewire_jax.core.errors import UserError
 from rewire_jax.core.pytrees import count
 from rewire_jax.core.settings import (
     SacSettings,
     Settings,
-    traced_fields,
     typed_settings,
     validate,
-    with_traced,
 )
 from rewire_jax.envs.base import Environment, HostEnvironment, Task
 from rewire_jax.envs.scenarios import Scenario, check_scenario, make_scenario
-from rewire_jax.methods import find_method
+from rewire_jax.methods import find_method, segments
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
-from rewire_jax.training import compiled_functions, population
+from rewire_jax.training import change_detection, compiled_functions, population
 from rewire_jax.training.compiled_functions import Program
 from rewire_jax.training.loop_state import LoopConfig
 from rewire_jax.training.member_functions import MemberFunctions
@@ -102,6 +98,7 @@ def spec_of(settings: Settings, observations: int, actions: int) -> Spec:
         updates=settings.updates
         * (settings.interactions - settings.warmup)
         // (settings.envs * settings.update_every),
+        segments=2 * settings.tasks if settings.boundaries == "detected" else 0,
     )
 
 
@@ -133,6 +130,11 @@ def prepare(
     settings, scenario = complete(settings, scenario)
     members = members or population.of_run(settings)
     filled = [*members, *[members[0]] * (num_slots - len(members))]
+    require(
+        settings.boundaries == "given" or len(filled) == 1,
+        "--boundaries detected: members would notice changes at different times; train "
+        "each seed alone, with --seeds 1",
+    )
     mesh = population.mesh(len(filled))
     functions = make_functions(settings, scenario)
     sequence = scenario.tasks[: settings.tasks]
@@ -198,67 +200,6 @@ def complete(
     return settings, scenario
 
 
-def with_values(
-    settings: Settings, sac: SacSettings | None, options: Any
-) -> tuple[SacSettings, Any]:
-    """Returns settings of SAC and of the method with the traced values of others.
-
-    Args:
-      settings: checked and complete.
-      sac: SAC's settings with the wanted values; None for the given ones.
-      options: the method's settings, in the same way.
-
-    Raises:
-      UserError: another class, or an invalid value. What JAX traces is not checked.
-    """
-    known = {
-        "sac": _known(settings.sac, sac, "sac"),
-        "options": _known(settings.options, options, "options"),
-    }
-    validate(dataclasses.replace(settings, **known))
-    known["options"].checked()
-    return (
-        with_traced(settings.sac, settings.sac if sac is None else sac),
-        with_traced(settings.options, settings.options if options is None else options),
-    )
-
-
-def _known(own: Any, given: Any, name: str) -> Any:
-    """Settings with the values of others, apart from those that JAX traces.
-
-    Args:
-      own: checked and complete settings of SAC or of the method.
-      given: settings with the wanted values; None for the own ones.
-      name: name of the argument.
-
-    Raises:
-      UserError: another class, a static value that differs, or a value that is no
-        single number.
-    """
-    if given is None:
-        return own
-    kind = type(own)
-    if not isinstance(given, kind):
-        raise UserError(f"{name} must be a {kind.__name__}, not {given!r:.80}")
-    values = {}
-    for field in dataclasses.fields(kind):
-        value, before = getattr(given, field.name), getattr(own, field.name)
-        if field.name not in traced_fields(kind):
-            # Zero is what `checked` fills in.
-            fixed = not isinstance(value, jax.core.Tracer)
-            same = fixed and (value == before or value == field.default == 0)
-            require(same, f"{flag(field.name)} cannot differ from {before} here")
-            continue
-        shape = np.shape(value)
-        require(not shape, f"{flag(field.name)} has the shape {shape}: use jax.vmap")
-        if not isinstance(value, jax.core.Tracer):
-            values[field.name] = value.item() if hasattr(value, "item") else value
-        elif not jnp.issubdtype(value.dtype, jnp.floating):
-            whole = jnp.issubdtype(value.dtype, jnp.integer)
-            require(whole, f"{flag(field.name)} must be a number, not {value.dtype}")
-    return dataclasses.replace(own, **values)
-
-
 def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
     """Returns the functions of one member; computes nothing.
 
@@ -287,8 +228,32 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
         f"--buffer {settings.buffer} is too short for an episode, which --resume "
         f"replays from it: give at least {least * settings.envs}",
     )
+    if settings.boundaries == "detected":
+        _check_detection(settings, config, hosted)
     make = find_method(settings.method).make
     return MemberFunctions(environment, make, make_spec(settings, environment), config)
+
+
+def _check_detection(settings: Settings, config: LoopConfig, hosted: bool) -> None:
+    """Raises `UserError` if changes of task cannot be noticed."""
+    require(
+        not hosted,
+        f"--boundaries detected: {settings.scenario} on {settings.backend} steps on "
+        "the host, where changes cannot be detected; use another backend",
+    )
+    least = (change_detection.WINDOW + 1) * chunk_steps(settings)
+    require(
+        config.transitions >= least,
+        f"--boundaries detected compares {least * settings.envs} interactions, "
+        f"{change_detection.WINDOW + 1} progress reports: lower --report-every, or "
+        "raise --buffer and --interactions",
+    )
+
+
+def chunk_steps(settings: Settings) -> int:
+    """Vector steps between two progress reports: whole rounds of updates."""
+    rounds = settings.report_every // (settings.envs * settings.update_every)
+    return max(rounds, 1) * settings.update_every
 
 
 def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
@@ -298,8 +263,13 @@ def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
       UserError: there are too few.
     """
     environment = functions.environment
-    method = functions.make(functions.spec, settings.options)
+    method = segments.build(functions.make, functions.spec, settings.options)
     candidates = _count_candidates(settings, functions)
+    require(
+        not candidates or settings.boundaries == "given",
+        "--boundaries detected: when a change is noticed, no policy can be tried on "
+        "the task before it; add --selection-episodes 0",
+    )
     interactions = settings.interactions
     round_ = settings.update_every * settings.envs
     if method.in_budget:
@@ -325,7 +295,7 @@ def make_budget(settings: Settings, functions: MemberFunctions) -> Budget:
 
 def _count_candidates(settings: Settings, functions: MemberFunctions) -> int:
     """Returns how many candidates the method has at the end of a task."""
-    method = functions.make(functions.spec, settings.options)
+    method = segments.build(functions.make, functions.spec, settings.options)
     if method.candidates is None or not settings.selection_episodes:
         return 0
     member = Members(jax.random.key(0), settings.sac, settings.options)

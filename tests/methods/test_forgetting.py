@@ -18,7 +18,7 @@ from rewire_jax.envs.scenarios import SCENARIOS, ScenarioSpec, make_scenario
 from rewire_jax.methods import METHODS
 from rewire_jax.nn import networks
 from rewire_jax.reports import metrics
-from rewire_jax.run import run_state
+from rewire_jax.run import run_checkpoints
 from rewire_jax.storage import checkpoint
 from rewire_jax.training import run_setup
 from tests.compiles import assert_once, compiles
@@ -232,7 +232,7 @@ def test_tasks_are_recognised_by_their_returns(
 def test_csp_plays_what_its_search_found(trained: Callable[[str], Trained]) -> None:
     prepared = run_setup.prepare(settings("csp"), SCENARIO)
     learner = jax.eval_shape(prepared.program.init, prepared.stacked)
-    path = run_state.kept(trained("csp").folder, None)
+    path = run_checkpoints.kept(trained("csp").folder, None)
     like = {"policy": (learner.params, learner.method_state)}
     _, state = checkpoint.load(path, like)[0]["policy"]
     for best, proposals in zip(state.best, state.proposals, strict=True):
@@ -249,7 +249,7 @@ def test_what_was_learned_online_is_distilled(
     like = {"policy": (learner.params, learner.method_state)}
     online = []
     for stage in range(len(GOALS)):
-        path = run_state.kept(folder, stage)
+        path = run_checkpoints.kept(folder, stage)
         params, _ = checkpoint.load(path, like)[0]["policy"]
         for seed in range(SEEDS):
             first = jax.tree.map(lambda x, seed=seed: np.asarray(x)[seed], params)

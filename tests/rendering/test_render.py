@@ -17,7 +17,7 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.rendering import render
-from rewire_jax.run import run_state
+from rewire_jax.run import run_checkpoints, run_state
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of
 from rewire_jax.training.run_setup import prepare
@@ -55,7 +55,7 @@ def untrained(folder: Path, scenario: str, *, stage: int = 2, **more) -> Path:
     }
     with run_folder.held(folder, header):
         at = batch(folder, stage - 1, 0) if "members" in more else folder
-        run_state.save(at, run_state.start(plan)._replace(stage=stage), plan)
+        run_checkpoints.save(at, run_state.start(plan)._replace(stage=stage), plan)
     return folder
 
 

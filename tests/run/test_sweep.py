@@ -15,7 +15,7 @@ import pytest
 import rewire_jax
 from rewire_jax.cli import main
 from rewire_jax.core.errors import UserError
-from rewire_jax.run import run_state, sweep_grid, train_run
+from rewire_jax.run import run_checkpoints, sweep_grid, train_run
 from rewire_jax.training import run_setup
 from tests.command_line import fails
 from tests.small_sweep import GRID, near, rows, small, sweep_words
@@ -124,7 +124,7 @@ def kept(folder: Path) -> list[np.ndarray]:
         chosen = [members[n] for n in batch]
         prepared = run_setup.prepare(settings, members=chosen, num_slots=first["size"])
         path = folder / f"task-001/batch-{number:03d}"
-        leaves += jax.tree.leaves(run_state.read_kept(path, 1, prepared))
+        leaves += jax.tree.leaves(run_checkpoints.read_kept(path, 1, prepared))
     return leaves
 
 
@@ -140,7 +140,7 @@ def test_a_killed_sweep_resumes_bit_for_bit(swept: Path, tmp_path: Path) -> None
             break
         time.sleep(0.002)
     assert process.wait() == -signal.SIGKILL
-    assert not run_state.finished(folder / "task-001/batch-000", 1)
+    assert not run_checkpoints.finished(folder / "task-001/batch-000", 1)
     done = run(command(folder, "--resume"))
     assert done.returncode == 0, done.stderr
     for path in swept.glob("task-*/batch-*/*.jsonl"):

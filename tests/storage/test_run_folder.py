@@ -10,7 +10,7 @@ import pytest
 
 from rewire_jax.core.errors import UserError, writing
 from rewire_jax.core.settings_json import to_json
-from rewire_jax.run import run_state
+from rewire_jax.run import run_checkpoints
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.run_folder import HEADER, held
 from rewire_jax.version import __version__
@@ -146,7 +146,7 @@ def test_settings_of_another_version_name_it(change, said, tmp_path: Path) -> No
         head["provenance"]["versions"] = versions
         (tmp_path / HEADER).write_text(json.dumps(head))
         for read in (
-            lambda: run_state.saved(tmp_path),
+            lambda: run_checkpoints.saved(tmp_path),
             lambda: run_folder.compare(tmp_path, tiny()),
         ):
             with pytest.raises(UserError, match=said) as caught:

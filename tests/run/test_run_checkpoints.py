@@ -13,7 +13,7 @@ import rewire_jax
 from rewire_jax import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.settings_json import digest
-from rewire_jax.run import run_state
+from rewire_jax.run import run_checkpoints, run_state
 from rewire_jax.storage.run_folder import TABLES
 from rewire_jax.training.run_setup import prepare
 from tests.tiny import tiny
@@ -102,7 +102,7 @@ def test_another_runs_checkpoint_is_never_used(
 ) -> None:
     plan = prepare(small(**change))
     state = run_state.start(plan)._replace(stage=2)
-    run_state.save(run.parent / "other", state, plan)
+    run_checkpoints.save(run.parent / "other", state, plan)
     shutil.rmtree(run / "checkpoints/task-002")
     shutil.move(run.parent / "other/checkpoints/task-002", run / "checkpoints")
     for use in (

@@ -1,0 +1,52 @@
+"""Delays and false alarms from hand-made rows of segments."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from rewire_jax.reports import noticed_changes
+from rewire_jax.reports.run_summary import summarize
+from rewire_jax.storage.run_results import read_run
+from tests.fake_run import write_run
+
+# Of two seeds, after each of the three reports in a task.
+SEGMENTS = {
+    0: [[0, 0, 0], [1, 1, 2], [2, 2, 2]],
+    1: [[0, 1, 1], [1, 1, 1], [1, 2, 4]],
+}
+
+
+def write(folder: Path) -> Path:
+    folder = write_run(folder, method="ft_n", boundaries="detected")
+    path = folder / "training.jsonl"
+    found = [json.loads(line) for line in path.read_text().splitlines()]
+    count: dict[tuple[int, int], int] = {}
+    for row in found:
+        key = row["seed"], row["stage"]
+        place = count[key] = count.get(key, -1) + 1
+        row["segment"] = SEGMENTS[row["seed"]][row["stage"]][place]
+    path.write_text("".join(json.dumps(row) + "\n" for row in found))
+    return folder
+
+
+def test_delays_and_false_alarms(tmp_path: Path) -> None:
+    run = read_run(write(tmp_path / "run"))
+    at = run.segments[0][0]
+    first, second, third = noticed_changes.noticed(run)
+    np.testing.assert_array_equal(first.delays, [np.nan, np.nan])
+    np.testing.assert_array_equal(first.false_alarms, [0, 1])
+    np.testing.assert_array_equal(second.delays, [at[0], np.nan])
+    np.testing.assert_array_equal(second.false_alarms, [1, 0])
+    np.testing.assert_array_equal(third.delays, [np.nan, at[1]])
+    np.testing.assert_array_equal(third.false_alarms, [0, 2])
+    table = noticed_changes.table(summarize([run]))
+    assert [row[2] for row in table.rows] == ["–", "1 of 2", "1 of 2"]
+    assert [row[4] for row in table.rows] == ["1", "1", "2"]
+
+
+def test_runs_that_are_told_the_tasks_have_none(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path / "run"))
+    assert noticed_changes.noticed(run) == ()
+    assert noticed_changes.table(summarize([run])).rows == []
+    assert noticed_changes.to_json(run) == {}
