@@ -14,6 +14,12 @@ NAMES = {
     "csp": "CSP",
     "rewire": "Ours (rewire)",
 }
+LABELS = NAMES | {
+    "cka": "CKA-RL",
+    "clonex": "ClonEx-SAC",
+    "reset_distill": "Reset & Distill",
+}
+"""The names in reports; methods of other papers as those call them."""
 
 
 class Figures(NamedTuple):

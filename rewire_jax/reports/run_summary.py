@@ -327,7 +327,7 @@ def _methods(runs: Sequence[RunData]) -> list[str]:
 
 
 def _shown(name: str) -> str:
-    return paper_results.NAMES.get(name, name)
+    return paper_results.LABELS.get(name, name)
 
 
 def _labels(runs: Sequence[RunData]) -> list[str]:
