@@ -174,9 +174,9 @@ class Settings:
       boundaries: "given" tells the learner when the task changes; "detected" does not:
         it starts a new task when a model of the environment, checked at each progress
         report, no longer predicts what happens.
-      detection_threshold: with `boundaries` "detected", how many times the usual
-        spread the model's error must leave its latest values; larger numbers give fewer
-        false alarms and miss more changes.
+      detection_threshold: with `boundaries` "detected", a change is noticed if a
+        report's score is farther than this many spreads from the median of the latest
+        scores. Larger numbers give fewer false alarms and miss more changes.
       sac: Soft Actor-Critic's settings.
       options: the method's own settings.
     """

@@ -16,6 +16,7 @@ from rewire_jax.methods import (
     regularization,
     reset_distill,
     rewire_settings,
+    segments,
 )
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.csp import csp
@@ -43,6 +44,10 @@ class Entry(NamedTuple):
     preset: Callable[[str, int, str], Any]
     selection_episodes: int | None = None
     together: Callable[[Sequence[Any]], list[Any]] = list
+
+    def build(self, spec: Spec, options: Any) -> Method:
+        """The method for the tasks or segments of a run, see `segments.build`."""
+        return segments.build(self.make, spec, options)
 
 
 # Those of the paper in the order of its Table 1, then others.

@@ -19,7 +19,7 @@ class Spec(NamedTuple):
         `networks.between`.
       updates: SAC updates in a task.
       segments: largest number of segments, if the method is not told the tasks, see
-        `--boundaries`; else 0. A method is then made with `tasks` of this number.
+        `--boundaries`; else 0. The method itself is then made for this many tasks.
     """
 
     observations: int
@@ -32,9 +32,9 @@ class Spec(NamedTuple):
     segments: int = 0
 
     def slots(self, most: int) -> int:
-        """Slots for tasks of which the same recur after `most` places, if at all.
+        """Returns the number of slots if tasks recur after `most` places.
 
-        Which segments are the same task is unknown: each of them has a slot.
+        It is unknown which segments are of the same task, so each has a slot.
         """
         return self.tasks if self.segments else min(most, self.tasks)
 

@@ -23,9 +23,9 @@ class Noticed:
     """What the seeds of a run noticed in a task.
 
     Attributes:
-        delays: `[seeds]`, interactions from the change to this task until it was
+        delays: `[kept seeds]`, interactions from the change to this task until it was
             noticed; NaN if it was not, and in the first task.
-        false_alarms: `[seeds]` int, other changes that were noticed.
+        false_alarms: `[kept seeds]` int, other changes that were noticed.
     """
 
     delays: NDArray[np.float64]
@@ -35,14 +35,16 @@ class Noticed:
 def noticed(run: RunData) -> tuple[Noticed, ...]:
     """What a run noticed in each task that it began; empty if it was told the tasks."""
     found = []
-    before = np.zeros(len(run.seeds))
-    for task, (interactions, segments) in enumerate(run.segments):
+    before = np.zeros(run.kept.sum())
+    for task, (interactions, values) in enumerate(run.segments):
+        segments = values[run.kept]
         if not interactions.size:
             break
         new = segments - before[:, None] > 0
         first = interactions[new.argmax(axis=1)]
         seen = new.any(axis=1) & (task > 0)
-        rises = np.nan_to_num(np.nanmax(segments, axis=1, initial=0) - before)
+        known = np.column_stack([before, segments])  # `before` alone may be known
+        rises = np.nanmax(known, axis=1) - before
         found.append(Noticed(np.where(seen, first, np.nan), (rises - seen).astype(int)))
         before = before + rises
     return tuple(found)
@@ -55,7 +57,7 @@ def table(comparison: Comparison) -> Table:
         run = summary.run
         for place, at in enumerate(noticed(run)):
             seen = at.delays[~np.isnan(at.delays)]
-            of = f"{seen.size} of {len(run.seeds)}"
+            of = f"{seen.size} of {run.kept.sum()}"
             rows.append(
                 [
                     summary.label,

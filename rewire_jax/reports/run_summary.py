@@ -211,7 +211,9 @@ def _areas(run: RunData, done: int) -> Array:
 
 def _reference(runs: Sequence[RunData]) -> tuple[RunData | None, str | None]:
     """The SAC-N run that normalises all runs, or None and why there is none."""
-    found = [run for run in runs if run.settings["method"] == "sac_n"]
+    found = [
+        run for run in runs if run.settings["method"] == "sac_n" and not run.segments
+    ]
     if len(found) != 1:
         some = "more than one SAC-N run" if found else "no SAC-N run"
         return None, f"there is {some} among them to normalise with"

@@ -173,11 +173,13 @@ def read_campaign(file: str | Path) -> Campaign:
 
 def as_populations(runs: Sequence[PlannedRun]) -> list[PlannedRun]:
     """The same training with consecutive seeds of a configuration as one run."""
-    made: dict[tuple[str, str, int, int], PlannedRun] = {}
+    made: dict[tuple[str, str, int, int, int], PlannedRun] = {}
     for run in sorted(runs, key=lambda run: run.settings.seed):
         # Seeds minus turns are equal where seeds are consecutive.
         start = run.settings.seed - run.turn
-        key = run.settings.scenario, run.configuration, run.priority, start
+        # Members of a population cannot notice changes of task each for itself.
+        alone = run.settings.seed if run.settings.boundaries == "detected" else 0
+        key = run.settings.scenario, run.configuration, run.priority, start, alone
         first = made.get(key)
         if first is None:
             made[key] = run

@@ -1,6 +1,7 @@
 """A run whose learner is not told when the task changes (`--boundaries detected`)."""
 
 import functools
+import math
 from typing import Any
 
 import jax
@@ -39,9 +40,7 @@ class DetectingRun(Run):
         state = program.begin(members, now.learner, now.active, 0, task)
         return now._replace(learner=None, state=state, segment=Segment(0, 0, ()))
 
-    def after_chunk(
-        self, now: RunState, task: Task, steps: int
-    ) -> tuple[RunState, dict[str, np.ndarray]]:
+    def after_chunk(self, now: RunState) -> tuple[RunState, dict[str, np.ndarray]]:
         """Starts a new segment if the chunk does not fit the ones before it.
 
         The metrics are `deviation`, see `change_detection`, and `segment`, the number
@@ -54,11 +53,12 @@ class DetectingRun(Run):
         if now.segment_time >= (change_detection.WINDOW + 1) * chunk:
             score = self.score(now, chunk)
             deviation = change_detection.deviation(segment.scores, score)
-            scores = (*segment.scores, score)[-change_detection.HISTORY :]
-            now = now._replace(segment=segment._replace(scores=scores))
+            if math.isfinite(score):
+                scores = (*segment.scores, score)[-change_detection.HISTORY :]
+                now = now._replace(segment=segment._replace(scores=scores))
         more = now.segment_number + 1 < self.plan.spec.segments
         if deviation > settings.detection_threshold and more:
-            now = self.next_segment(now, steps)
+            now = self.next_segment(now)
             self.recorder.progress.message(
                 f"a change of task was noticed in task {now.stage}, after "
                 f"{now.steps * settings.envs:,} interactions"
@@ -73,14 +73,11 @@ class DetectingRun(Run):
         scores = _surprise(length, chunk)(now.state.collection.buffer, now.segment_time)
         return float(scores[0])
 
-    def next_segment(self, now: RunState, steps: int) -> RunState:
-        """Ends the segment before its last `steps` vector steps, and starts another.
-
-        The running episodes go on.
-        """
+    def next_segment(self, now: RunState) -> RunState:
+        """Ends the segment and starts another, in the running episodes."""
         program, index = self.plan.program, now.segment_number + 1
         assert now.state is not None
-        learner = self.ended(now, now.segment_time - steps)
+        learner = self.ended(now)
         assigned = segments.assign(learner.method_state, now.stage, index)
         assigned = population.place(assigned, self.plan.mesh)
         learner = learner._replace(method_state=assigned)
@@ -93,8 +90,11 @@ class DetectingRun(Run):
         )
         return now._replace(state=state, segment=Segment(index, -now.steps, ()))
 
-    def ended(self, now: RunState, time: int) -> TrainState:
-        """The learner if its segment ended after `time` vector steps; `now` is kept."""
+    def ended(self, now: RunState) -> TrainState:
+        """The learner if its segment ended here; `now` stays usable.
+
+        The steps of the report in which a change was noticed belong to the segment.
+        """
         program, members = self.plan.program, self.plan.stacked
         rounds = self.plan.budget.offline_steps
         state = now.state
@@ -102,7 +102,9 @@ class DetectingRun(Run):
         if now.segment_time == 0:
             return state.learner
         if program.consolidate:
-            learner = program.consolidate(members, state, now.segment_number, time)
+            learner = program.consolidate(
+                members, state, now.segment_number, now.segment_time
+            )
             state = state._replace(learner=learner)
         if rounds:
             # The function uses its argument up.
@@ -110,7 +112,7 @@ class DetectingRun(Run):
                 members,
                 jax.tree.map(jnp.copy, state),
                 now.segment_number,
-                time,
+                now.segment_time,
                 0,
                 rounds,
             )
@@ -118,7 +120,7 @@ class DetectingRun(Run):
 
     def leave(self, now: RunState) -> RunState:
         """Takes a learner out as it would be if its segment ended here."""
-        return now._replace(learner=self.ended(now, now.segment_time))
+        return now._replace(learner=self.ended(now))
 
     def conclude(self, now: RunState, task: Task) -> RunState:
         """Ends the task; the learner goes on in its segment."""

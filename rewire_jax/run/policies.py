@@ -12,7 +12,7 @@ import numpy as np
 from rewire_jax.core.arguments import check_optional, check_whole, require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
-from rewire_jax.methods import find_method, segments
+from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method
 from rewire_jax.methods.spec import Spec
 from rewire_jax.run import halving, run_checkpoints, sweep_members
@@ -149,7 +149,7 @@ def load_policy(
             raise UserError(
                 f"{folder} has no seed {seed}: see {run_folder.HEADER} there"
             )
-    method = segments.build(find_method(settings.method).make, spec, options)
+    method = find_method(settings.method).build(spec, options)
     learned = jax.tree.map(lambda leaf: leaf[found.place], _load(found, method, owner))
     policy = method.policy(learned.params, learned.method_state, jnp.asarray(task))
     return functools.partial(mean_action, method, spec, policy)
@@ -173,8 +173,7 @@ def load_policies(run: str | Path, *, stage: int | None = None) -> Policies:
         "the policies of one",
     )
     header, settings, spec = _read(folder, "run")
-    make = find_method(settings.method).make
-    method = segments.build(make, spec, settings.options)
+    method = find_method(settings.method).build(spec, settings.options)
     stage = run_checkpoints.latest(folder) if stage is None else stage
 
     def candidates(member: Learned) -> tuple[int, ...]:

@@ -1,7 +1,8 @@
 """The checkpoints of a run.
 
 `checkpoints/task-003` is never deleted. It contains policies and critics after three
-finished tasks; everything else is reset at the start of a task.
+finished tasks; everything else is reset at the start of a task. With `--boundaries
+detected` it contains everything.
 `checkpoints/task-003-step-0000200` contains everything in the middle of the next task;
 only the newest of these is kept.
 """

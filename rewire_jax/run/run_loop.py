@@ -42,7 +42,7 @@ class Run:
         logs: Loggers | None = None,
         choosing: bool = False,
     ):
-        """See `train`.
+        """See `train_run.train`.
 
         Args:
           plan: plan of the run.
@@ -165,25 +165,21 @@ class Run:
             members, now.state, now.segment_number, task, now.segment_time, steps
         )
         report = jax.tree.map(np.asarray, report)
-        seconds = clock.perf_counter() - began
         compiles = program.traces() > traces
         now = self.advance(now, state, steps)
-        now, noticed = self.after_chunk(now, task, steps)
+        now, noticed = self.after_chunk(now)
+        seconds = clock.perf_counter() - began
         inspected = report.inspected | noticed
         report = report._replace(inspected=inspected)
         self.recorder.chunk(now, report, seconds, compiles, steps)
         self.save(now, done)
         return now
 
-    def after_chunk(
-        self, now: RunState, task: Task, steps: int
-    ) -> tuple[RunState, dict[str, np.ndarray]]:
+    def after_chunk(self, now: RunState) -> tuple[RunState, dict[str, np.ndarray]]:
         """Lets the method consolidate after the last interaction of a task.
 
         Args:
           now: state of the run after the chunk.
-          task: the task.
-          steps: vector steps in the chunk.
 
         Returns:
           The state, and metrics `[members]` to report.

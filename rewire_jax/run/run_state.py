@@ -17,8 +17,8 @@ class Segment(NamedTuple):
 
     Attributes:
       number: number of the segment, from 0.
-      offset: vector steps made in it before the current task; minus the steps made in
-        the task before it, if it began later.
+      offset: added to the vector steps in the current task, it gives those in the
+        segment; negative if the segment began in this task.
       scores: latest scores of `change_detection.surprise` in it, oldest first.
     """
 

@@ -16,7 +16,7 @@ from rewire_jax.core.arguments import require
 from rewire_jax.core.settings import SacSettings, Settings
 from rewire_jax.envs.base import Environment, Task
 from rewire_jax.envs.scenarios import Scenario
-from rewire_jax.methods import find_method, segments
+from rewire_jax.methods import find_method
 from rewire_jax.methods.base import Method, Selection
 from rewire_jax.training import random_keys, rollout, selection
 from rewire_jax.training.acting import Act, Learned, act_function
@@ -164,8 +164,7 @@ def make_act(settings: Settings, scenario: Scenario | None = None) -> Act:
     """
     settings, scenario = complete(settings, scenario)
     spec = make_functions(settings, scenario).spec
-    make = find_method(settings.method).make
-    method = segments.build(make, spec, settings.options)
+    method = find_method(settings.method).build(spec, settings.options)
     return act_function(method, spec)
 
 

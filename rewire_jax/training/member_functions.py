@@ -29,8 +29,8 @@ from rewire_jax.training.sac import TrainState
 class MemberFunctions:
     """Functions of one member; their attributes are static.
 
-    `member` is an entry of `Members`; `index` is a task's `[]` int in the sequence;
-    `time` is the number of vector steps made in this task.
+    `member` is an entry of `Members`; `index` is the `[]` int of a task in the
+    sequence, or of a segment; `time` is the number of vector steps made in it.
 
     Attributes:
       environment: environment of the scenario.

@@ -23,7 +23,7 @@ from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.machine_memory import machine_bytes
 from rewire_jax.envs.base import HostEnvironment
-from rewire_jax.methods import find_method, segments
+from rewire_jax.methods import find_method
 from rewire_jax.methods.shared import map_own
 from rewire_jax.training import colored_noise, rollout, train_loop
 from rewire_jax.training.run_setup import Plan
@@ -78,7 +78,10 @@ def _held(plan: Plan) -> tuple[Any, Any]:
 
 def check(plan: Plan) -> None:
     """Raises `UserError` if the arrays stored in training exceed the memory."""
-    held = size(_held(plan)[1])
+    state = _held(plan)[1]
+    held = size(state)
+    if plan.settings.boundaries == "detected":
+        held += size(state.collection.buffer)  # of two segments, where one ends
     room = _total(list(plan.mesh.devices.flat))
     require(
         room is None or held <= room,
@@ -146,8 +149,8 @@ def _play(plan: Plan, policies: Any, rows: int, episodes: int) -> int:
     policies = map_own(lambda x: _cut(x, 1, rows, axes=2), _cut(policies, 1))
     if isinstance(environment, HostEnvironment):
         return size(policies)  # episodes take nothing of the device
-    make = find_method(plan.settings.method).make
-    act = segments.build(make, plan.spec, plan.settings.options).act
+    entry = find_method(plan.settings.method)
+    act = entry.build(plan.spec, plan.settings.options).act
 
     def roll(tasks, policies, keys):
         return rollout.episodes(environment, act, tasks, policies, keys, episodes)
@@ -159,7 +162,7 @@ def _play(plan: Plan, policies: Any, rows: int, episodes: int) -> int:
 def need(plan: Plan) -> Need:
     """The memory of each member of a plan; traces, but compiles nothing."""
     program, settings, spec = plan.program, plan.settings, plan.spec
-    environment, make = plan.scenario.environment, find_method(settings.method).make
+    environment, entry = plan.scenario.environment, find_method(settings.method)
     fresh, state = _held(plan)
 
     def learn(member, state):
@@ -171,7 +174,7 @@ def need(plan: Plan) -> Need:
             True,
             updates=settings.updates,
             environment=environment,
-            method=segments.build(make, spec, member.options),
+            method=entry.build(spec, member.options),
             settings=member.sac,
         )
 

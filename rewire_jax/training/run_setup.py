@@ -229,17 +229,22 @@ def make_functions(settings: Settings, scenario: Scenario) -> MemberFunctions:
         f"replays from it: give at least {least * settings.envs}",
     )
     if settings.boundaries == "detected":
-        _check_detection(settings, config, hosted)
+        _check_detection(settings, config, environment)
     make = find_method(settings.method).make
     return MemberFunctions(environment, make, make_spec(settings, environment), config)
 
 
-def _check_detection(settings: Settings, config: LoopConfig, hosted: bool) -> None:
+def _check_detection(
+    settings: Settings,
+    config: LoopConfig,
+    environment: Environment | HostEnvironment,
+) -> None:
     """Raises `UserError` if changes of task cannot be noticed."""
+    # Varied environments have a simulator for each task, and reset at fixed times.
     require(
-        not hosted,
-        f"--boundaries detected: {settings.scenario} on {settings.backend} steps on "
-        "the host, where changes cannot be detected; use another backend",
+        isinstance(environment, Environment) and not environment.varied,
+        f"--boundaries detected: on {settings.backend} an episode cannot go on in "
+        f"another task of {settings.scenario}; use a scenario on Brax",
     )
     least = (change_detection.WINDOW + 1) * chunk_steps(settings)
     require(

@@ -17,8 +17,8 @@ SEGMENTS = {
 }
 
 
-def write(folder: Path) -> Path:
-    folder = write_run(folder, method="ft_n", boundaries="detected")
+def write(folder: Path, diverged: tuple[int, ...] = ()) -> Path:
+    folder = write_run(folder, method="ft_n", boundaries="detected", diverged=diverged)
     path = folder / "training.jsonl"
     found = [json.loads(line) for line in path.read_text().splitlines()]
     count: dict[tuple[int, int], int] = {}
@@ -43,6 +43,14 @@ def test_delays_and_false_alarms(tmp_path: Path) -> None:
     table = noticed_changes.table(summarize([run]))
     assert [row[2] for row in table.rows] == ["–", "1 of 2", "1 of 2"]
     assert [row[4] for row in table.rows] == ["1", "1", "2"]
+
+
+def test_diverged_seeds_do_not_count(tmp_path: Path) -> None:
+    run = read_run(write(tmp_path / "run", diverged=(1,)))
+    second = noticed_changes.noticed(run)[1]
+    assert second.delays.tolist() == [run.segments[1][0][0]]
+    table = noticed_changes.table(summarize([run]))
+    assert [row[2] for row in table.rows] == ["–", "1 of 1", "0 of 1"]
 
 
 def test_runs_that_are_told_the_tasks_have_none(tmp_path: Path) -> None:

@@ -80,6 +80,19 @@ def test_consecutive_seeds_become_a_population(tmp_path):
     assert sum(len(run.seeds) for run in together) == len(made.runs)
 
 
+def test_seeds_that_notice_changes_themselves_stay_alone(tmp_path):
+    more = '[runs.settings]\nboundaries = "detected"\nselection-episodes = 0'
+    more += "\ninteractions = 64000"
+    text = TWO.replace("[runs.settings]", more, 1)
+    made = read_campaign(write(tmp_path, text))
+    together = as_populations(made.runs)
+    assert [run.name for run in together][:2] == [
+        "probe/reach/rewire-k-1/seed-0",
+        "probe/reach/rewire-k-1/seed-1",
+    ]
+    assert sum(len(run.seeds) for run in together) == len(made.runs)
+
+
 ENTRY = '[[runs]]\nscenarios = ["probe/reach"]\nmethods = ["ft1"]\n'
 OTHER = ENTRY.replace("ft1", "rewire")
 
