@@ -17,6 +17,7 @@ from rewire_jax.reports import paper_results
 from rewire_jax.run.evaluation import most_stored
 from rewire_jax.training.run_setup import base_size, make_spec
 
+_NO_SIZE = "updates", "segments"  # of a spec, in these runs
 TITLE = "Model size: most numbers stored in a run, divided by those of a plain policy"
 FORMULAS = {
     "ft1": "1",
@@ -80,7 +81,7 @@ def measure(name: str) -> Iterator[dict[str, Any]]:
         yield {
             "scenario": name,
             "method": method,
-            **{n: v for n, v in spec._asdict().items() if n != "updates"},
+            **{n: v for n, v in spec._asdict().items() if n not in _NO_SIZE},
             "plain": base_size(spec),
             "least": min(numbers),
             "most": max(numbers),

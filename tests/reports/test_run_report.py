@@ -73,7 +73,7 @@ def test_stored_states_have_a_column_only_where_there_are_some(tmp_path: Path) -
     bare = write_run(tmp_path / "bare", method="ft1")
     storing = write_run(tmp_path / "storing", method="clonex", stored=1.2)
     report = write_report([bare, storing], tmp_path / "both")
-    for label, method, stored in (("FT-1", "ft1", 0.0), ("clonex", "clonex", 3.6)):
+    for label, method, stored in (("FT-1", "ft1", 0.0), ("ClonEx-SAC", "clonex", 3.6)):
         row = cells(report.page, label)
         assert (row["model size"], row["stored states"]) == ("2.25", f"{stored:.2f}")
         of = {row["method"]: row for row in rows(report.folder / "report.csv")}
