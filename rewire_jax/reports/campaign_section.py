@@ -19,6 +19,7 @@ from rewire_jax.reports.run_summary import (
 )
 from rewire_jax.reports.spread import Interval
 from rewire_jax.reports.statistics import Array, estimate, stratified_bootstrap
+from rewire_jax.reports.table import Table
 from rewire_jax.reports.titles import several
 from rewire_jax.storage.merged_results import merged
 from rewire_jax.storage.run_results import RunData
@@ -52,6 +53,10 @@ class Section:
     def labels(self) -> list[str]:
         """Of the configurations, in the order of the tables."""
         return [summary.label for summary in self.report.numbers.summaries]
+
+    def task_tables(self) -> tuple[Table, ...]:
+        """Tables with a row for each configuration and task."""
+        return run_report.task_tables(self.report.numbers)
 
     def pictures(self) -> list[tuple[str, str]]:
         """Title and data URI of each picture."""

@@ -54,8 +54,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
     """
     title, notes = _title(comparison), tuple(_notes(comparison))
     results, costs = run_tables.results(comparison), run_tables.costs(comparison)
-    tasks, changes = run_tables.tasks(comparison), noticed_changes.table(comparison)
-    found = [changes] if changes.rows else []
+    tasks = task_tables(comparison)
     rows = [[*r, *c[1:]] for r, c in zip(results.rows, costs.rows, strict=True)]
     return Report(
         folder=folder,
@@ -65,7 +64,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
         numbers=comparison,
         table=Table([*results.heads, *costs.heads[1:]], rows),
         # A terminal is too narrow for all columns side by side.
-        shown=(*found, tasks, costs, results),
+        shown=(*tasks, costs, results),
         reading=tuple(_reading(comparison)),
         texts={
             "report.csv": run_tables.results_csv(comparison),
@@ -78,12 +77,18 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
             "matrix.png": "Matrix",
         },
         draw=partial(_draw, comparison, title),
-        details=[line for each in (tasks, *found) for line in to_markdown(*each)],
+        details=[line for each in tasks for line in to_markdown(*each)],
         origins=[
             *(origin(each.label, each.run) for each in comparison.summaries),
             *(origin(f"{run.tasks[0]} alone", run) for run in comparison.single),
         ],
     )
+
+
+def task_tables(comparison: Comparison) -> tuple[Table, ...]:
+    """Tables with a row for each run and task."""
+    tasks, changes = run_tables.tasks(comparison), noticed_changes.table(comparison)
+    return (tasks, changes) if changes.rows else (tasks,)
 
 
 def _reading(comparison: Comparison) -> Iterator[str]:

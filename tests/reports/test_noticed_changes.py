@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rewire_jax.reports import noticed_changes
+from rewire_jax.reports import noticed_changes, run_report
 from rewire_jax.reports.run_summary import summarize
 from rewire_jax.storage.run_results import read_run
 from tests.fake_run import write_run
@@ -43,6 +43,7 @@ def test_delays_and_false_alarms(tmp_path: Path) -> None:
     table = noticed_changes.table(summarize([run]))
     assert [row[2] for row in table.rows] == ["–", "1 of 2", "1 of 2"]
     assert [row[4] for row in table.rows] == ["1", "1", "2"]
+    assert run_report.task_tables(summarize([run]))[-1] == table
 
 
 def test_diverged_seeds_do_not_count(tmp_path: Path) -> None:
@@ -58,3 +59,4 @@ def test_runs_that_are_told_the_tasks_have_none(tmp_path: Path) -> None:
     assert noticed_changes.noticed(run) == ()
     assert noticed_changes.table(summarize([run])).rows == []
     assert noticed_changes.to_json(run) == {}
+    assert len(run_report.task_tables(summarize([run]))) == 1
