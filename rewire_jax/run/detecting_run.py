@@ -60,8 +60,8 @@ class DetectingRun(Run):
         if deviation > settings.detection_threshold and more:
             now = self.next_segment(now)
             self.recorder.progress.message(
-                f"a change of task was noticed in task {now.stage}, after "
-                f"{now.steps * settings.envs:,} interactions"
+                f"a change of task was noticed in task {now.stage + 1}, after "
+                f"{now.steps * settings.envs:,} of its interactions"
             )
         metrics = {"deviation": deviation, "segment": now.segment_number}
         return now, {name: np.array([value]) for name, value in metrics.items()}
@@ -97,15 +97,10 @@ class DetectingRun(Run):
         """
         program, members = self.plan.program, self.plan.stacked
         rounds = self.plan.budget.offline_steps
-        state = now.state
-        assert state is not None
+        assert now.state is not None
         if now.segment_time == 0:
-            return state.learner
-        if program.consolidate:
-            learner = program.consolidate(
-                members, state, now.segment_number, now.segment_time
-            )
-            state = state._replace(learner=learner)
+            return now.state.learner
+        state = self.consolidated(now)
         if rounds:
             # The function uses its argument up.
             state = program.offline_update(

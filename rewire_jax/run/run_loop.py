@@ -169,8 +169,7 @@ class Run:
         now = self.advance(now, state, steps)
         now, noticed = self.after_chunk(now)
         seconds = clock.perf_counter() - began
-        inspected = report.inspected | noticed
-        report = report._replace(inspected=inspected)
+        report = report._replace(inspected=report.inspected | noticed)
         self.recorder.chunk(now, report, seconds, compiles, steps)
         self.save(now, done)
         return now
@@ -184,22 +183,26 @@ class Run:
         Returns:
           The state, and metrics `[members]` to report.
         """
+        if now.steps == self.plan.budget.steps:
+            now = now._replace(state=self.consolidated(now))
+        return now, {}
+
+    def consolidated(self, now: RunState) -> RunnerState:
+        """Returns the state after the method has consolidated, if it does."""
         program, state = self.plan.program, now.state
         assert state is not None
-        if now.steps == self.plan.budget.steps and program.consolidate:
-            learner = program.consolidate(
-                self.plan.stacked, state, now.stage, now.steps
-            )
-            now = now._replace(state=state._replace(learner=learner))
-        return now, {}
+        if not program.consolidate:
+            return state
+        members, place = self.plan.stacked, (now.segment_number, now.segment_time)
+        return state._replace(learner=program.consolidate(members, state, *place))
 
     def offline_update(self, now: RunState) -> RunState:
         """Updates from the buffer until the next progress report."""
         began = clock.perf_counter()
         plan, budget = self.plan, self.plan.budget
         before, settings = now.steps, plan.settings
-        rounds = settings.report_every // (settings.envs * settings.update_every)
-        steps = _due(max(rounds, 1), before, self.end)
+        rounds = run_setup.chunk_steps(settings) // settings.update_every
+        steps = _due(rounds, before, self.end)
         traces = plan.program.traces()
         state = plan.program.offline_update(
             plan.stacked,

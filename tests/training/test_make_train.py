@@ -176,26 +176,23 @@ def test_settings_of_another_class_are_refused(part: str, value: Any) -> None:
         make_train(small("rewire"))(jax.random.key(0), **{part: value})
 
 
-@pytest.mark.parametrize("value", [jnp.ones(1), jnp.ones(32), jnp.asarray(True)])
-def test_traced_values_must_be_single_numbers(value: jax.Array) -> None:
+# Traced settings must be single numbers, and a static one cannot be traced.
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("reward_scale", jnp.ones(1)),
+        ("reward_scale", jnp.ones(32)),
+        ("reward_scale", jnp.asarray(True)),
+        ("batch_size", jnp.asarray(small("ft1").sac.batch_size)),
+    ],
+)
+def test_values_that_cannot_be_traced_are_refused(name: str, value: jax.Array) -> None:
     settings = small("ft1")
     train = make_train(settings)
 
-    def at(scale: jax.Array) -> Any:
-        sac = dataclasses.replace(settings.sac, reward_scale=scale)
+    def at(traced: jax.Array) -> Any:
+        sac = dataclasses.replace(settings.sac, **{name: traced})
         return train(jax.random.key(0), sac=sac)
 
-    with pytest.raises(UserError, match="--reward-scale"):
+    with pytest.raises(UserError, match="--" + name.replace("_", "-")):
         jax.eval_shape(at, value)
-
-
-def test_a_static_value_cannot_be_traced() -> None:
-    settings = small("ft1")
-    train = make_train(settings)
-
-    def at(size: jax.Array) -> Any:
-        sac = dataclasses.replace(settings.sac, batch_size=size)
-        return train(jax.random.key(0), sac=sac)
-
-    with pytest.raises(UserError, match="--batch-size"):
-        jax.eval_shape(at, jnp.asarray(settings.sac.batch_size))
