@@ -85,6 +85,8 @@ def to_html(report: CampaignReport) -> str:
     data = report.data
     return environment.get_template("campaign.html").render(
         campaign=data.campaign,
+        finished=len(data.finished),
+        failed=bool(data.status.failed or data.unreadable),
         hours=data.status.hours and number(data.status.hours),
         progress=_progress(data),
         unfinished=_unfinished(data),

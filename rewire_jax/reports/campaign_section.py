@@ -62,7 +62,7 @@ class Section:
         """Title and data URI of each picture."""
         import matplotlib
 
-        titles = {"profiles.png": "Performance profiles", **self.report.pictures}
+        titles = {**self.report.pictures, "profiles.png": "Performance profiles"}
         with (
             TemporaryDirectory() as made,
             # A name with dollars is no formula.

@@ -1,12 +1,13 @@
 """Picture of performance profiles, as in Agarwal et al. (NeurIPS 2021)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter, StrMethodFormatter
 
-from rewire_jax.reports.plots import Array, empty, entitle, look
+from rewire_jax.reports.plots import Array, entitle, methods_figure
 
 
 class Profile(NamedTuple):
@@ -35,22 +36,26 @@ def profiles(
         title: above the picture.
         path: the PNG file to write.
     """
-    figure, (axes,) = empty((9.0, 5.0), 1, 1)
-    for i, line in enumerate(lines):
-        style = look(i)
-        axes.plot(thresholds, line.shares, **style, linewidth=1.6, label=line.label)
-        if line.interval is not None:
+
+    def draw(axes: Axes, place: int, style: Mapping[str, Any], band: float) -> None:
+        line = lines[place]
+        axes.plot(thresholds, line.shares, **style)
+        if band and line.interval is not None:
             axes.fill_between(
-                thresholds, *line.interval, color=style["color"], alpha=0.12, lw=0
+                thresholds, *line.interval, color=style["color"], alpha=band, lw=0
             )
-    axes.set_xlabel(f"score at the end ({unit})")
-    axes.set_ylabel("share of seeds and tasks above it")
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
-    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_xlim(thresholds[0], thresholds[-1])
-    axes.set_ylim(-0.02, 1.02)
-    axes.grid(color="0.9")
-    axes.set_axisbelow(True)
-    figure.legend(loc="outside right center", frameon=False)
+
+    labels = [line.label for line in lines]
+    figure, panels = methods_figure(labels, (9.0, 5.0), draw)
+    for axes in panels:
+        axes.grid(color="0.9")
+        axes.set_axisbelow(True)
+    first = panels[0]
+    first.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
+    first.yaxis.set_major_formatter(PercentFormatter(1.0))
+    first.set_xlim(thresholds[0], thresholds[-1])
+    first.set_ylim(-0.02, 1.02)
+    figure.supxlabel(f"score at the end ({unit})", fontsize=10)
+    figure.supylabel("share of seeds and tasks above it", fontsize=10)
     entitle(figure, title, "higher is better; bands: 95% bootstrap intervals")
     figure.savefig(path)

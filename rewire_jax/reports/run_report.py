@@ -72,6 +72,7 @@ def make(comparison: Comparison, folder: Path) -> Report[Comparison]:
             "result.json": _json(comparison, title, notes),
         },
         pictures={
+            "iqm.png": "Interquartile means",
             "tradeoff.png": "Performance and model size",
             "curves.png": "Learning curves",
             "matrix.png": "Matrix",
@@ -136,21 +137,27 @@ def _notes(comparison: Comparison) -> Iterator[str]:
 
 def _draw(comparison: Comparison, title: str, folder: Path) -> None:
     # Here, because Matplotlib takes long to import.
-    from rewire_jax.reports import plots
+    from rewire_jax.reports.interval_plot import intervals
+    from rewire_jax.reports.matrix_plot import Matrix, matrices
+    from rewire_jax.reports.sequence_plot import Training, curves
     from rewire_jax.reports.tradeoff_plot import Point, tradeoff
 
-    lines, points = [], []
+    trained, evaluated, points = [], [], []
     for summary in comparison.summaries:
         run, kept, value = summary.run, summary.run.kept, summary.performance
+        stages = [(x, values[kept]) for x, values in run.curve]
+        trained.append(Training(summary.label, stages))
         scores = np.concatenate([run.before[:, None], run.scores], axis=1)
-        curve = [(x, values[kept]) for x, values in run.curve]
-        lines.append(plots.Line(summary.label, curve, scores[kept]))
+        evaluated.append(Matrix(summary.label, scores[kept]))
         mean = math.nan if value.mean is None else value.mean
         points.append(Point(summary.label, run.model_size, mean, value.std))
+    means = [(summary.label, summary.iqm) for summary in comparison.summaries]
+    quantity = f"interquartile mean at the end ({comparison.unit})"
     score, budget = comparison.score, int(run.settings["interactions"])
+    intervals(means, quantity, title, folder / "iqm.png")
     tradeoff(points, comparison.unit, title, folder / "tradeoff.png")
-    plots.curves(lines, run.tasks, budget, score, title, folder / "curves.png")
-    plots.matrices(lines, run.tasks, score, title, folder / "matrix.png")
+    curves(trained, run.tasks, budget, score, title, folder / "curves.png")
+    matrices(evaluated, run.tasks, score, title, folder / "matrix.png")
 
 
 def _json(comparison: Comparison, title: str, notes: tuple[str, ...]) -> str:

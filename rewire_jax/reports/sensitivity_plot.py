@@ -91,7 +91,7 @@ def _draw(place: Axes, dots: Sequence[Dot], joined: bool) -> None:
     line = [dot for dot in dots if dot.whole]
     if joined:
         where = [dot.value for dot in line]
-        place.plot(where, [dot.mean for dot in line], **look(0), linewidth=1.3)
+        place.plot(where, [dot.mean for dot in line], **(look(0) | {"linewidth": 1.3}))
     for dot in dots:
         colour = _BEST if dot.best else look(0)["color"]
         place.errorbar(

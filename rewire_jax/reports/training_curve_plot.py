@@ -86,7 +86,7 @@ def evolution(
             axes.fill_between(
                 curve.x, low, high, color=style["color"], alpha=0.2, linewidth=0
             )
-            axes.plot(curve.x, middle, **style, linewidth=1.6, label=curve.label)
+            axes.plot(curve.x, middle, **style, label=curve.label)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if not log:
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))

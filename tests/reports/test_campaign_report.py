@@ -196,7 +196,7 @@ def test_unfinished_failed_and_damaged_runs_are_named(tmp_path: Path) -> None:
     assert len(made.sections[0].unfinished) == 2
     text = made.page.read_text()
     for job in (unfinished, failed, damaged):
-        assert text.count(f"<td>{job.run.name}</td>") == 2  # in two tables
+        assert text.count(f">{job.run.name}</td>") == 2  # in two tables
     assert "error: &lt;b&gt;no disk" in text
 
 
@@ -221,7 +221,7 @@ def test_the_page_is_one_file_and_escapes_names(tmp_path: Path) -> None:
     assert "&lt;script&gt;a &amp;" in page
     assert not re.search(r"https?:|//[a-z]", re.sub(r"base64,[^\"]*", "", page))
     sources = re.findall(r"<img src=\"([^\"]{30})", page)
-    assert len(sources) == 4
+    assert len(sources) == 5
     assert all(source.startswith("data:image/png;base64,") for source in sources)
     assert not re.search(r"<(link|script|iframe|object)", page)
 
