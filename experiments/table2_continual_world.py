@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from experiments import averages, paper_table, suite
 from rewire_jax.core.arguments import require
 from rewire_jax.reports import paper_results
+from rewire_jax.reports.titles import budget
 from rewire_jax.storage.scores import SUCCESS, Success
 
 CW10 = "continual_world/cw10"
@@ -40,11 +41,9 @@ def run(job: Table2) -> None:
     settings = next(iter(runs.values()))[0].settings
     title = (
         f"Table 2 on Meta-World v3, {job.profile} profile, "
-        f"{settings.interactions:,} interactions a task, reward {settings.reward}, "
+        f"{budget(vars(settings))}, reward {settings.reward}, "
         f"{settings.backend} backend"
     )
-    if settings.interactions < (settings.paper_interactions or 0):
-        title += f", reduced budget (paper: {settings.paper_interactions:,})"
     score = SUCCESS[job.success]
     (paper,) = paper_results.sources(CW10)
     reading = (

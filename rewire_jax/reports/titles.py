@@ -1,5 +1,6 @@
 """Titles that name what was run, and with what budget."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from rewire_jax.envs.scenarios import SCENARIOS
@@ -8,6 +9,17 @@ from rewire_jax.envs.scenarios import SCENARIOS
 def several(count: int, noun: str) -> str:
     """A number of things: 1 seed, 2 seeds."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def budget(settings: Mapping[str, Any]) -> str:
+    """The interactions of a run, and the paper's where they are more."""
+    given, paper = int(settings["interactions"]), settings.get("paper_interactions")
+    text = f"{given:,} interactions a task"
+    if paper is None:
+        return text if settings["profile"] == "paper" else f"reduced budget of {text}"
+    if given < int(paper):
+        return f"reduced budget of {text} (paper: {int(paper):,})"
+    return text
 
 
 def heading(
@@ -26,7 +38,6 @@ def heading(
         seeds: how many, of each run.
         configurations: how many, each with all seeds; of a run 0.
     """
-    budget, paper = int(settings["interactions"]), settings.get("paper_interactions")
     spec = SCENARIOS.get(settings["scenario"])
     whole = len(spec.changes) * spec.repeats if spec else tasks
     rewards = []
@@ -41,13 +52,9 @@ def heading(
     parts = [
         f"{subject}: {settings['profile']} profile",
         f"{tasks} of {whole} tasks" if tasks < whole else several(tasks, "task"),
-        f"{budget:,} interactions a task",
+        budget(settings),
         *rewards,
         f"{settings['backend']} backend",
         members,
     ]
-    if paper is not None and budget < int(paper):
-        parts.append(f"reduced budget (paper: {int(paper):,})")
-    elif paper is None and settings["profile"] != "paper":
-        parts.append("reduced budget")
     return ", ".join(parts)

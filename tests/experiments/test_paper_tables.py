@@ -75,8 +75,8 @@ def test_table2_averages_success_rates_over_triplets(trained, tmp_path, capsys):
     assert float(found["CW10", "rewire"]["paper_performance"]) == 0.84
     shown = (out / "table2.md").read_text()
     assert shown.startswith(
-        "# Table 2 on Meta-World v3, quick profile, 30,000 interactions a task, "
-        "reward v2, mujoco backend, reduced budget (paper: 1,000,000)\n"
+        "# Table 2 on Meta-World v3, quick profile, reduced budget of 30,000 "
+        "interactions a task (paper: 1,000,000), reward v2, mujoco backend\n"
     )
     head = "| method | CW3 | model size | paper | CW10 | model size | paper |"
     assert head in shown

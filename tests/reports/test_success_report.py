@@ -30,9 +30,9 @@ def test_success_rates_are_never_normalised(tmp_path: Path) -> None:
     ]
     report = write_report(runs, tmp_path / "out")
     assert report.title == (
-        "continual_world/t3 on Meta-World v3: quick profile, 3 tasks, 1,000 "
-        "interactions a task, reward v2, mujoco backend, 2 seeds, reduced budget "
-        "(paper: 1,000,000)"
+        "continual_world/t3 on Meta-World v3: quick profile, 3 tasks, reduced budget "
+        "of 1,000 interactions a task (paper: 1,000,000), reward v2, mujoco backend, "
+        "2 seeds"
     )
     assert report.notes == ()
     # Of seed 0 (0.4 + 0.5 + 0.7) / 3, and seed 1 has 0.1 more.
