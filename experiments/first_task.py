@@ -1,7 +1,7 @@
 """Shared code of the plots of training: learning curves on the first task.
 
-Each seed is a separate run. So several commands can train different seeds or variants
-in parallel (`--seed`, `--seeds`, `--variants`), and a last command plots them all.
+Each seed is a separate run. A script trains the runs one after the other. Or it shows
+those of a campaign, which trains several side by side and keeps them (`--campaign`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +14,7 @@ import numpy as np
 from experiments import suite
 from rewire_jax.core.arguments import require
 from rewire_jax.core.formatting import number
+from rewire_jax.reports.campaign_data import read_campaign_data
 from rewire_jax.reports.plots import Array
 from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.titles import heading
@@ -37,12 +38,20 @@ class FirstTask(suite.Experiment):
     Attributes:
       scenario: name of the scenario.
       tasks: number of tasks to train; only the first task is shown.
-      variants: names of the variants to train and show; all if empty.
+      campaign: TOML file of a campaign with the variants as configurations; its runs
+        are shown, nothing is trained, and flags of training have no effect.
     """
 
     scenario: str = "halfcheetah/forgetting"
     tasks: int = 1
-    variants: tuple[str, ...] = ()
+    campaign: Path | None = None
+
+    def folder(self, what: str) -> Path:
+        """The folder of a result."""
+        if self.campaign is None:
+            return super().folder(what)
+        parent = suite.RESULTS if self.keep else self.out
+        return parent / f"{what}-{self.campaign.stem}"
 
     def first_runs(self, variants: suite.Variants) -> list[suite.Run]:
         """A run for each seed and variant, one seed after the other.
@@ -50,21 +59,11 @@ class FirstTask(suite.Experiment):
         Reports and checkpoints are as dense as a curve needs. What the policy earns in
         the end is told by 128 episodes at most.
         """
-        unknown = set(self.variants) - set(variants)
-        require(
-            not unknown,
-            f"--variants {' '.join(unknown)}: choose from {', '.join(variants)}",
-        )
-        chosen = {
-            name: variant
-            for name, variant in variants.items()
-            if name in (self.variants or variants)
-        }
         runs = []
         for seed in range(self.seed, self.seed + self.seeds):
             one = replace(self, seed=seed, seeds=1)
             parent = self.out / self.name(f"{self.scenario}-first-task")
-            for run in one.runs(self.scenario, chosen):
+            for run in one.runs(self.scenario, variants):
                 given = run.settings
                 settings = replace(
                     given,
@@ -133,15 +132,24 @@ def train(
     labels: Mapping[str, str],
     value: str | None = None,
 ) -> Evolution:
-    """Trains what is unfinished, and reads it; raises as `suite.train` and `read`."""
-    runs = job.first_runs(variants)
-    suite.train(runs, job)
+    """Trains what is unfinished, and reads it.
+
+    Raises:
+      UserError: as `suite.train`, `read_campaign_data` and `read` do.
+    """
+    if job.campaign is not None:
+        data = read_campaign_data(job.campaign)
+        runs = {each.folder: each.run.name in data.finished for each in data.jobs}
+    else:
+        planned = job.first_runs(variants)
+        suite.train(planned, job)
+        runs = {run.folder: run.finished for run in planned}
     return read(subject, runs, labels, value)
 
 
 def read(
     subject: str,
-    runs: Sequence[suite.Run],
+    runs: Mapping[Path, bool],
     labels: Mapping[str, str],
     value: str | None = None,
 ) -> Evolution:
@@ -149,7 +157,8 @@ def read(
 
     Args:
       subject: what the title begins with.
-      runs: of one seed each, in folders of their variants.
+      runs: folders of one seed each, in folders of their variants, and whether they
+        are finished.
       labels: by variant.
       value: name of what to read; by default it is the training return.
 
@@ -159,9 +168,9 @@ def read(
     found, origins, settings, tasks = {}, [], {}, 1
     for name, label in labels.items():
         datas = [
-            read_run(run.folder)
-            for run in runs
-            if run.folder.parent.name == name and run.finished
+            read_run(folder)
+            for folder, finished in runs.items()
+            if folder.parent.name == name and finished
         ]
         kept = [data for data in datas if data.kept.all()]
         if kept:
@@ -170,7 +179,7 @@ def read(
         if datas:
             origins.append(origin(label, *datas))
     require(bool(found), "none of the runs has ended without divergence")
-    missing = [str(run.folder) for run in runs if not run.finished]
+    missing = [str(folder) for folder, finished in runs.items() if not finished]
     if missing:
         origins.append(f"- **not finished: {', '.join(missing)}**")
     seeds = [len(trained.seeds) for trained in found.values()]

@@ -33,7 +33,7 @@ from experiments.table3_ablation import Table3
         (table3_ablation, Table3, "--scenario probe/reach --profile slow"),
         (figure4_tradeoff, Figure4, "--scenarios probe/reach --interactions 3"),
         (figure5_evolution, FirstTask, "--scenario probe/reach --tasks 9"),
-        (figure5_evolution, FirstTask, "--scenario probe/reach --variants ft2"),
+        (figure5_evolution, FirstTask, "--scenario probe/reach --campaign no.toml"),
     ],
 )
 def test_what_is_wrong_ends_in_a_line_before_anything_runs(

@@ -1,17 +1,20 @@
 """Figures 3 and 5: curves of the first task, read from runs and summed up."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments import figure3_mode_kl, first_task, suite
+from experiments import figure3_mode_kl, figure5_evolution, first_task
 from experiments.figure3_mode_kl import pattern, tell
 from experiments.figure5_evolution import beats, reached
 from experiments.first_task import FirstTask
 from rewire_jax.core.errors import UserError
+from rewire_jax.core.settings_json import to_json
 from rewire_jax.reports.training_curve_plot import Curve
+from rewire_jax.run.campaign_file import read_campaign
 from tests.fake_run import rows, write_run
 from tests.tiny import shrink_presets
 
@@ -54,13 +57,13 @@ def test_figure3_of_a_real_run(tmp_path, monkeypatch):
     assert shown.count("of 2 seeds") == 2
 
 
-def fake(folder: Path, values: np.ndarray, **kept) -> list[suite.Run]:
-    """Runs of a seed each, with these returns; an episode is ten steps long."""
-    runs = []
-    for seed, each in enumerate(values):
-        run = suite.Run(folder / f"seed-{seed}", None, None)
+def fake(folder: Path, values: np.ndarray, first=0, **kept) -> dict[Path, bool]:
+    """Finished runs of a seed each, with these returns; an episode has ten steps."""
+    runs = {}
+    for seed, each in enumerate(values, first):
+        run = folder / f"seed-{seed}"
         write_run(
-            run.folder,
+            run,
             envs=ENVS,
             stages=1,
             tasks=("normal",),
@@ -74,18 +77,16 @@ def fake(folder: Path, values: np.ndarray, **kept) -> list[suite.Run]:
             for x, value in zip(X, each, strict=True)
         ]
         lines = "".join(json.dumps(row) + "\n" for row in told)
-        (run.folder / "training.jsonl").write_text(lines)
-        runs.append(run)
+        (run / "training.jsonl").write_text(lines)
+        runs[run] = True
     return runs
 
 
 def test_the_end_is_the_last_tenth_without_the_diverged(tmp_path):
     rng = np.random.default_rng(0)
     ours, plain = 100 * rng.random((2, 4, POINTS))
-    runs = [
-        *fake(tmp_path / "rewire", ours, diverged=(1,)),
-        *fake(tmp_path / "ft1", plain),
-    ]
+    runs = fake(tmp_path / "rewire", ours, diverged=(1,))
+    runs |= fake(tmp_path / "ft1", plain)
     title, found, origins = first_task.read("Figure 9", runs, LABELS)
     assert title.startswith("Figure 9 on the first task of halfcheetah/forgetting")
     assert ", 3 to 4 seeds" in title
@@ -103,7 +104,7 @@ def test_the_end_is_the_last_tenth_without_the_diverged(tmp_path):
 
 def test_reports_that_only_some_seeds_made_are_left_out(tmp_path):
     runs = fake(tmp_path / "ft1", np.ones((2, POINTS)))
-    path = runs[0].folder / "training.jsonl"
+    path = next(iter(runs)) / "training.jsonl"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
     curve = first_task.read("Figure 9", runs, LABELS).found["ft1"].curve
     np.testing.assert_array_equal(curve.x, X[1:])
@@ -113,13 +114,57 @@ def test_reports_that_only_some_seeds_made_are_left_out(tmp_path):
 def test_runs_with_nothing_to_show_are_left_out(tmp_path):
     ft1 = fake(tmp_path / "ft1", np.ones((2, POINTS)))
     (waiting,) = fake(tmp_path / "rewire", np.ones((1, POINTS)))
-    (waiting.folder / "results.jsonl").unlink()
-    found = first_task.read("Figure 9", [waiting, *ft1], LABELS)
+    (waiting / "results.jsonl").unlink()
+    found = first_task.read("Figure 9", {waiting: False, **ft1}, LABELS)
     assert list(found.found) == ["ft1"]
     assert "rewire/seed-0" in found.origins[-1]
     lost = fake(tmp_path / "lost" / "ft1", np.ones((2, POINTS)), diverged=(0, 1))
     with pytest.raises(UserError, match="without divergence"):
-        first_task.read("Figure 9", [waiting, *lost], LABELS)
+        first_task.read("Figure 9", {waiting: False, **lost}, LABELS)
+
+
+def test_a_figure_of_the_runs_of_a_campaign(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "some.toml"
+    file.write_text(
+        """
+        title = "First task"
+        population = "never"
+        [[runs]]
+        scenarios = ["probe/reach"]
+        methods = ["ft1", "rewire"]
+        seeds = 2
+        profile = "quick"
+        [runs.settings]
+        tasks = 1
+        [[runs]]
+        scenarios = ["probe/reach"]
+        methods = ["rewire"]
+        name = "rewire-k1"
+        profile = "quick"
+        [runs.settings]
+        tasks = 1
+        modes = 1
+        """
+    )
+    for run in read_campaign(file).runs:
+        if run.name != "probe/reach/rewire/seed-1":
+            folder = Path("runs/some") / run.name
+            seed = run.settings.seed
+            values = np.full((1, POINTS), 100.0 + seed)
+            (fake_folder,) = fake(tmp_path / "fake" / run.name, values, first=seed)
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(fake_folder, folder)
+            head = json.loads((folder / "settings.json").read_text())
+            head |= {"settings": to_json(run.settings)}
+            (folder / "settings.json").write_text(json.dumps(head))
+    figure5_evolution.run(FirstTask(campaign=file))
+    shown = Path("runs/figure5-some/figure5.md").read_text()
+    assert "| FT-1 | 2 | 100 | 100 |" in shown
+    assert "| FT-1 | 100 / 1,000 | 101 / 1,200 |" in shown
+    assert "| Ours | 1 |" in shown
+    assert "| Rewire (K = 1) | 1 |" in shown
+    assert "**not finished: runs/some/probe/reach/rewire/seed-1**" in shown
 
 
 def test_how_probable_one_earns_more():

@@ -74,7 +74,3 @@ def test_figure5_turns_modes_and_distillation_off(trained, tmp_path, monkeypatch
     job = dataclasses.replace(job, seeds=3, train=False)
     figure5_evolution.run(job)
     assert "rewire-k1/seed-2" in path.with_suffix(".md").read_text()
-    some = dataclasses.replace(job, variants=("ft1", "rewire"), seed=2, train=True)
-    trained.clear()
-    figure5_evolution.run(some)
-    assert [f.parent.name for f, *_ in trained] == ["ft1", "rewire"] * 3
