@@ -166,5 +166,5 @@ docs: setup ## Build the documentation into site/; a warning is an error
 
 clean: ## Remove caches and build outputs; .venv and runs/ stay
 	rm -rf .jax_cache .mypy_cache .pytest_cache .ruff_cache build dist site \
-		docs/drawings docs/notebooks jupyter_execute *.egg-info
+		docs/notebooks jupyter_execute *.egg-info
 	find rewire_jax experiments docs notebooks tests -name __pycache__ -type d -prune -exec rm -rf {} +

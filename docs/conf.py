@@ -11,7 +11,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # for docs and experiments
 
-from docs import drawings, made  # noqa: E402
+from docs import made  # noqa: E402
 
 project = "rewire_jax"
 author = "the authors of rewire_jax"
@@ -50,8 +50,7 @@ def _fields(app: Any, what: str, name: str, each: Any, *rest: Any) -> Any:
 
 
 def _prepare(app: Any) -> None:
-    """Makes the drawings, and copies the notebooks to where Sphinx looks for pages."""
-    drawings.write(ROOT / "docs/drawings")
+    """Copies the notebooks to where Sphinx looks for pages."""
     # Anew: pages of an earlier version would stand beside the copies.
     shutil.rmtree(ROOT / "docs/notebooks", ignore_errors=True)
     (ROOT / "docs/notebooks").mkdir()

@@ -1,4 +1,7 @@
-"""The drawings of the page on concepts, computed with the package's functions."""
+"""The drawings of the page on concepts, computed with the package's functions.
+
+`python -m docs.drawings` writes them anew.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ import rewire_jax
 from rewire_jax.methods import wiring
 from rewire_jax.nn.networks import Linear
 
+FOLDER = Path(__file__).with_name("drawings")
 _COLOURS = mpl.colormaps["tab10"].colors  # type: ignore[attr-defined]
 _SCORES = np.array([0.62, 0.10, 0.95, 0.35, 0.78, 0.22])
 _MODES = (
@@ -22,7 +26,7 @@ _MODES = (
     ([3, 1, 4, 0, 2], [1, 4, 2, 0, 3]),
 )
 # Makes the files reproducible.
-_STYLE: Any = {"svg.hashsalt": "rewire_jax", "font.size": 9}
+_STYLE: Any = {"svg.hashsalt": "rewire_jax", "svg.fonttype": "none", "font.size": 9}
 
 
 def write(folder: Path) -> list[Path]:
@@ -144,3 +148,7 @@ def _matrix(axes: Axes, matrix: Any, title: str, low: float, high: float) -> Non
     axes.imshow(np.asarray(matrix), cmap=colours, vmin=low, vmax=high)
     axes.set(xticks=[], yticks=[])
     axes.set_title(title, fontsize=9)
+
+
+if __name__ == "__main__":
+    write(FOLDER)

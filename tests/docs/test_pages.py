@@ -77,6 +77,12 @@ def test_a_method_and_a_domain_of_ones_own_train(newcomer: Path) -> None:
     assert len(rewire_jax.make_scenario("halfcheetah/slippery").tasks) == 4
 
 
+@pytest.mark.parametrize("page", pages(PYTHON))
+def test_python_blocks_can_be_compiled(page: str) -> None:
+    for example in PYTHON.parse(ROOT / page).examples():
+        compile(example.parsed, f"{page}:{example.line}", "exec")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "page", [page for page in pages(PYTHON) if page != "docs/extend.md"]
@@ -100,8 +106,6 @@ def commands(page: str) -> list[list[str]]:
 def test_shell_blocks_name_what_there_is(page: str, capsys) -> None:
     targets = (ROOT / "Makefile").read_text()
     for words in commands(page):
-        if words[0] == "taskset":
-            del words[:3]
         program, *rest = words
         if program == "make":
             assert re.search(rf"^{rest[0]}:.*## ", targets, re.M), words
