@@ -16,7 +16,6 @@ from docs import made  # noqa: E402
 project = "rewire_jax"
 author = "the authors of rewire_jax"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["drawings"]
 smartquotes = False  # They would make a dash of a flag's hyphens.
 default_role = "code"  # Docstrings quote code by single backticks.
 myst_heading_anchors = 3

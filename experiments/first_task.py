@@ -38,13 +38,15 @@ class FirstTask(suite.Experiment):
     Attributes:
       scenario: name of the scenario.
       tasks: number of tasks to train; only the first task is shown.
-      campaign: TOML file of a campaign with the variants as configurations; its runs
-        are shown, nothing is trained, and flags of training have no effect.
+      campaign: TOML file of a campaign whose configurations have the variants' names;
+        its runs are shown, and nothing is trained.
+      trained_in: folder of the campaign; by default runs/ and the name of the file.
     """
 
     scenario: str = "halfcheetah/forgetting"
     tasks: int = 1
     campaign: Path | None = None
+    trained_in: Path | None = None
 
     def folder(self, what: str) -> Path:
         """The folder of a result."""
@@ -138,18 +140,25 @@ def train(
       UserError: as `suite.train`, `read_campaign_data` and `read` do.
     """
     if job.campaign is not None:
-        data = read_campaign_data(job.campaign)
-        runs = {each.folder: each.run.name in data.finished for each in data.jobs}
+        data = read_campaign_data(job.campaign, job.trained_in)
+        runs = {
+            each.folder: data.finished.get(each.run.name)
+            for each in data.jobs
+            if each.run.settings.scenario == job.scenario
+        }
     else:
         planned = job.first_runs(variants)
         suite.train(planned, job)
-        runs = {run.folder: run.finished for run in planned}
+        runs = {
+            run.folder: read_run(run.folder) if run.finished else None
+            for run in planned
+        }
     return read(subject, runs, labels, value)
 
 
 def read(
     subject: str,
-    runs: Mapping[Path, bool],
+    runs: Mapping[Path, RunData | None],
     labels: Mapping[str, str],
     value: str | None = None,
 ) -> Evolution:
@@ -157,29 +166,28 @@ def read(
 
     Args:
       subject: what the title begins with.
-      runs: folders of one seed each, in folders of their variants, and whether they
-        are finished.
+      runs: by their folders, which are in folders of their variants; None for one that
+        is not finished.
       labels: by variant.
       value: name of what to read; by default it is the training return.
 
     Raises:
       UserError: there is nothing to show yet.
     """
+    runs = {path: run for path, run in runs.items() if path.parent.name in labels}
+    require(bool(runs), f"there are no runs named {', '.join(labels)}")
+    require(any(runs.values()), "none of the runs is finished yet")
     found, origins, settings, tasks = {}, [], {}, 1
     for name, label in labels.items():
-        datas = [
-            read_run(folder)
-            for folder, finished in runs.items()
-            if folder.parent.name == name and finished
-        ]
-        kept = [data for data in datas if data.kept.all()]
+        datas = [run for path, run in runs.items() if run and path.parent.name == name]
+        kept = [data for data in datas if data.kept.any()]
         if kept:
             found[name] = gather(label, kept, value)
             settings, tasks = kept[0].settings, len(kept[0].tasks)
         if datas:
             origins.append(origin(label, *datas))
     require(bool(found), "none of the runs has ended without divergence")
-    missing = [str(folder) for folder, finished in runs.items() if not finished]
+    missing = [str(path) for path, run in runs.items() if not run]
     if missing:
         origins.append(f"- **not finished: {', '.join(missing)}**")
     seeds = [len(trained.seeds) for trained in found.values()]
@@ -188,12 +196,15 @@ def read(
 
 
 def gather(label: str, kept: Sequence[RunData], value: str | None = None) -> Trained:
-    """Runs of one variant as one."""
-    parts = [(read_progress(run, value) if value else run.curve)[0] for run in kept]
+    """Runs of one variant as one, without their diverged seeds."""
+    parts = []
+    for run in kept:
+        x, values = (read_progress(run, value) if value else run.curve)[0]
+        parts.append((x, values[run.kept]))
     return Trained(
         Curve(label, *merged_curve(parts)),
-        tuple(seed for run in kept for seed in run.seeds),
-        np.concatenate([run.scores[:, 0, 0] for run in kept]),
+        tuple(int(s) for run in kept for s in np.array(run.seeds)[run.kept]),
+        np.concatenate([run.scores[run.kept, 0, 0] for run in kept]),
         kept[0].episode_length * float(kept[0].settings["envs"]),
     )
 

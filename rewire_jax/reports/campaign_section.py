@@ -156,11 +156,12 @@ def _draw_profiles(report: Report[Comparison], path: Path) -> None:
     def shares(*samples: Array) -> Array:
         return statistics.performance_profile(_ratio(*samples), thresholds)
 
-    lines = [
-        Profile(summary.label, shares(*samples), stratified_bootstrap(shares, *samples))
-        for summary, samples in zip(comparison.summaries, scores, strict=True)
-        if samples[0].size
-    ]
+    lines = []
+    for summary, samples in zip(comparison.summaries, scores, strict=True):
+        profile, interval = None, None
+        if samples[0].size:
+            profile, interval = shares(*samples), stratified_bootstrap(shares, *samples)
+        lines.append(Profile(summary.label, profile, interval))
     profiles(lines, thresholds, comparison.unit, report.title, path)
 
 

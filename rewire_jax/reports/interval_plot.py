@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.ticker import StrMethodFormatter
 
-from rewire_jax.reports.plots import empty, entitle, look
+from rewire_jax.reports.plots import empty, entitle, look, wrapped
 from rewire_jax.reports.spread import Interval
+
+# Without a cap, so that a bar is as long as its interval.
+_BAR: Any = {"linewidth": 5, "solid_capstyle": "butt"}
 
 
 def intervals(
@@ -27,13 +31,15 @@ def intervals(
         if each.value is not None
     ]
     shown.sort(key=lambda entry: entry[0])
-    figure, (axes,) = empty((8.0, max(3.2, 2.0 + 0.25 * len(shown))), 1, 1)
+    labels = [wrapped(label) for _, _, label, _ in shown]
+    lines = sum(1 + label.count("\n") for label in labels)
+    figure, (axes,) = empty((8.0, max(3.2, 2.0 + 0.25 * lines)), 1, 1)
     for row, (value, i, _, each) in enumerate(shown):
         colour = look(i)["color"]
         if each.low is not None and each.high is not None:
-            axes.plot([each.low, each.high], [row, row], color=colour, linewidth=5)
+            axes.plot([each.low, each.high], [row, row], color=colour, **_BAR)
         axes.plot(value, row, "o", color=colour, markersize=9, markeredgecolor="white")
-    axes.set_yticks(range(len(shown)), [label for _, _, label, _ in shown])
+    axes.set_yticks(range(len(shown)), labels)
     axes.set_ylim(-0.6, len(shown) - 0.4)
     axes.set_xlabel(quantity)
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))

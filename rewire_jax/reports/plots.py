@@ -29,6 +29,8 @@ _COLOURS = (
 )
 _STYLES = ("-", "--", ":")
 _ALIKE = 5  # lines of one style
+GREY = "; grey: the others"
+"""How to read a figure that has a panel for each method."""
 _TOGETHER = 6  # methods that can be told apart in one panel
 
 
@@ -43,7 +45,7 @@ class Draw(Protocol):
         Args:
             axes: the panel.
             place: which method, from 0.
-            style: of the line: colour, style and width.
+            style: of the line.
             band: opacity of the band around it; without one, 0.
         """
 
@@ -56,12 +58,16 @@ def mean(values: Array) -> Array:
 
 
 def empty(
-    size: tuple[float, float], rows: int, columns: int
+    size: tuple[float, float], rows: int, columns: int, *, shared: bool = False
 ) -> tuple[Figure, list[Axes]]:
-    """A figure of its own: `pyplot` would keep state between calls."""
+    """A figure of its own: `pyplot` would keep state between calls.
+
+    With `shared`, all panels have the same scales.
+    """
     figure = Figure(figsize=size, dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+    made = figure.subplots(rows, columns, squeeze=False, sharex=shared, sharey=shared)
+    return figure, list(made.flat)
 
 
 def grid(count: int) -> tuple[int, int]:
@@ -83,7 +89,7 @@ def methods_figure(
         draw: draws a method.
 
     Returns:
-        The figure and its panels; axes are still without ticks and names.
+        The figure and its panels, without names, limits and formats of numbers.
     """
     if len(labels) <= _TOGETHER:
         figure, panels = empty(size, 1, 1)
@@ -93,29 +99,36 @@ def methods_figure(
         figure.legend(handles=key, loc="outside right center", frameon=False)
         return figure, panels
     rows, columns = grid(len(labels))
-    figure, panels = empty((2.9 * columns, 2.1 * rows + 0.6), rows, columns)
+    size = 2.9 * columns, 2.1 * rows + 0.6
+    figure, panels = empty(size, rows, columns, shared=True)
     for place, (axes, label) in enumerate(zip(panels, labels, strict=False)):
-        axes.sharex(panels[0])
-        axes.sharey(panels[0])
         for other in range(len(labels)):
             if other != place:
                 draw(axes, other, {"color": "0.85", "linewidth": 0.7}, 0)
         draw(axes, place, look(place) | {"linestyle": "-"}, 0.25)
-        axes.text(
+        name = axes.text(
             0.03,
             0.96,
-            label,
+            wrapped(label),
             transform=axes.transAxes,
             verticalalignment="top",
             fontweight="bold",
             fontsize=9,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1},
         )
-        axes.tick_params(labelsize=8)
-        axes.label_outer()
+        # A long name must not make room for itself between the panels.
+        name.set_in_layout(False)
+        name.set_clip_on(True)
+        below_is_free = place + columns >= len(labels)
+        axes.tick_params(labelsize=8, labelbottom=below_is_free)
     for axes in panels[len(labels) :]:
         axes.set_axis_off()
     return figure, panels[: len(labels)]
+
+
+def wrapped(label: str) -> str:
+    """A label in lines that are short enough beside or in a panel."""
+    return "\n".join(textwrap.wrap(label, 32))
 
 
 def entitle(figure: Figure, title: str, reading: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter, StrMethodFormatter
 
-from rewire_jax.reports.plots import Array, entitle, methods_figure
+from rewire_jax.reports.plots import GREY, Array, entitle, methods_figure
 
 
 class Profile(NamedTuple):
@@ -15,12 +15,13 @@ class Profile(NamedTuple):
 
     Attributes:
         label: the method.
-        shares: share of scores above each threshold, `[thresholds]`.
+        shares: share of scores above each threshold, `[thresholds]`; None without
+            scores.
         interval: its ends, `[2, thresholds]`; None where there is none.
     """
 
     label: str
-    shares: Array
+    shares: Array | None
     interval: Array | None
 
 
@@ -39,6 +40,8 @@ def profiles(
 
     def draw(axes: Axes, place: int, style: Mapping[str, Any], band: float) -> None:
         line = lines[place]
+        if line.shares is None:
+            return
         axes.plot(thresholds, line.shares, **style)
         if band and line.interval is not None:
             axes.fill_between(
@@ -57,5 +60,8 @@ def profiles(
     first.set_ylim(-0.02, 1.02)
     figure.supxlabel(f"score at the end ({unit})", fontsize=10)
     figure.supylabel("share of seeds and tasks above it", fontsize=10)
-    entitle(figure, title, "higher is better; bands: 95% bootstrap intervals")
+    reading = "higher is better"
+    if any(line.interval is not None for line in lines):
+        reading += "; bands: 95% bootstrap intervals"
+    entitle(figure, title, reading + (GREY if len(panels) > 1 else ""))
     figure.savefig(path)

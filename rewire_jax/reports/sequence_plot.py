@@ -8,8 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter, StrMethodFormatter
 
-from rewire_jax.reports.plots import Array, entitle, mean, methods_figure
+from rewire_jax.reports.plots import GREY, Array, entitle, mean, methods_figure
 from rewire_jax.storage.scores import Score
+
+_NAMED = 5  # tasks whose names have room above a small panel
 
 
 class Training(NamedTuple):
@@ -57,7 +59,9 @@ def curves(
         axes.grid(axis="y", color="0.9")
         axes.set_axisbelow(True)
         if axes.get_subplotspec().is_first_row():  # type: ignore[union-attr]
-            _name_tasks(axes, tasks, budget, 9 if len(panels) == 1 else 6)
+            few = len(panels) == 1 or len(tasks) <= _NAMED
+            names = tasks if few else [str(k + 1) for k in range(len(tasks))]
+            _name_tasks(axes, names, budget, 9 if len(panels) == 1 else 6)
     first = panels[0]
     first.set_xlim(0, len(tasks) * budget)
     first.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -68,11 +72,8 @@ def curves(
         # Room for lines that run along an end.
         low, high = score.limits
         first.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
-    entitle(
-        figure,
-        title,
-        f"lines: {score.trained}, mean over seeds, band from lowest to highest",
-    )
+    reading = f"lines: {score.trained}, mean over seeds, band from lowest to highest"
+    entitle(figure, title, reading + (GREY if len(panels) > 1 else ""))
     figure.savefig(path)
 
 

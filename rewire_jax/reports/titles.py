@@ -12,7 +12,10 @@ def several(count: int, noun: str) -> str:
 
 
 def budget(settings: Mapping[str, Any]) -> str:
-    """The interactions of a run, and the paper's where they are more."""
+    """The interactions of a run, named as reduced where the paper has more.
+
+    Where the paper has none, those of profiles other than `paper` count as reduced.
+    """
     given, paper = int(settings["interactions"]), settings.get("paper_interactions")
     text = f"{given:,} interactions a task"
     if paper is None:

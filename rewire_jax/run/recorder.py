@@ -141,7 +141,8 @@ class Recorder:
             if now.active[place] and not active[place]:
                 self.progress.message(
                     f"{member.name}: a parameter became NaN or infinite in task "
-                    f"{now.stage}; it is no longer updated: try lower learning rates"
+                    f"{now.stage + 1}; it is no longer updated: try lower learning "
+                    "rates"
                 )
 
     def evaluation(

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import rewire_jax
@@ -95,6 +96,12 @@ def test_nothing_is_fetched_to_read_it(site) -> None:
         assert not re.findall(r"<(?:script|link|img)[^>]*=\"(?:https?:)?//", page)
 
 
+def numbers(drawing: Path) -> np.ndarray:
+    """The coordinates of all lines."""
+    lines = re.findall(r' d="(.*?)"', drawing.read_text(), re.S)
+    return np.array(re.findall(r"-?\d+\.\d+", " ".join(lines)), float)
+
+
 def test_drawings_are_the_same_each_time(tmp_path: Path) -> None:
     first, second = (drawings.write(tmp_path / name) for name in "ab")
     assert [path.stem for path in first] == ["permutation", "modes", "alignment"]
@@ -106,6 +113,8 @@ def test_drawings_are_the_same_each_time(tmp_path: Path) -> None:
             for path in (drawings.FOLDER / one.name, one)
         )
         assert shown == made != []
+        lines = [numbers(path) for path in (drawings.FOLDER / one.name, one)]
+        np.testing.assert_allclose(*lines, atol=0.5)
 
 
 def test_the_files_of_a_run_are_told(site, tmp_path: Path) -> None:

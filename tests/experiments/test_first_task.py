@@ -15,6 +15,7 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings_json import to_json
 from rewire_jax.reports.training_curve_plot import Curve
 from rewire_jax.run.campaign_file import read_campaign
+from rewire_jax.storage.run_results import RunData, read_run
 from tests.fake_run import rows, write_run
 from tests.tiny import shrink_presets
 
@@ -57,7 +58,7 @@ def test_figure3_of_a_real_run(tmp_path, monkeypatch):
     assert shown.count("of 2 seeds") == 2
 
 
-def fake(folder: Path, values: np.ndarray, first=0, **kept) -> dict[Path, bool]:
+def fake(folder: Path, values: np.ndarray, first=0, **kept) -> dict[Path, RunData]:
     """Finished runs of a seed each, with these returns; an episode has ten steps."""
     runs = {}
     for seed, each in enumerate(values, first):
@@ -78,7 +79,7 @@ def fake(folder: Path, values: np.ndarray, first=0, **kept) -> dict[Path, bool]:
         ]
         lines = "".join(json.dumps(row) + "\n" for row in told)
         (run / "training.jsonl").write_text(lines)
-        runs[run] = True
+        runs[run] = read_run(run)
     return runs
 
 
@@ -104,8 +105,10 @@ def test_the_end_is_the_last_tenth_without_the_diverged(tmp_path):
 
 def test_reports_that_only_some_seeds_made_are_left_out(tmp_path):
     runs = fake(tmp_path / "ft1", np.ones((2, POINTS)))
-    path = next(iter(runs)) / "training.jsonl"
+    first = next(iter(runs))
+    path = first / "training.jsonl"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[1:]))
+    runs[first] = read_run(first)
     curve = first_task.read("Figure 9", runs, LABELS).found["ft1"].curve
     np.testing.assert_array_equal(curve.x, X[1:])
     assert curve.values.shape == (2, POINTS - 1)
@@ -115,12 +118,16 @@ def test_runs_with_nothing_to_show_are_left_out(tmp_path):
     ft1 = fake(tmp_path / "ft1", np.ones((2, POINTS)))
     (waiting,) = fake(tmp_path / "rewire", np.ones((1, POINTS)))
     (waiting / "results.jsonl").unlink()
-    found = first_task.read("Figure 9", {waiting: False, **ft1}, LABELS)
+    found = first_task.read("Figure 9", {waiting: None, **ft1}, LABELS)
     assert list(found.found) == ["ft1"]
     assert "rewire/seed-0" in found.origins[-1]
     lost = fake(tmp_path / "lost" / "ft1", np.ones((2, POINTS)), diverged=(0, 1))
     with pytest.raises(UserError, match="without divergence"):
-        first_task.read("Figure 9", {waiting: False, **lost}, LABELS)
+        first_task.read("Figure 9", {waiting: None, **lost}, LABELS)
+    with pytest.raises(UserError, match="finished"):
+        first_task.read("Figure 9", {waiting: None}, LABELS)
+    with pytest.raises(UserError, match="no runs named"):
+        first_task.read("Figure 9", ft1, {"rewire": "Ours"})
 
 
 def test_a_figure_of_the_runs_of_a_campaign(tmp_path, monkeypatch):
@@ -131,7 +138,7 @@ def test_a_figure_of_the_runs_of_a_campaign(tmp_path, monkeypatch):
         title = "First task"
         population = "never"
         [[runs]]
-        scenarios = ["probe/reach"]
+        scenarios = ["probe/reach", "halfcheetah/forgetting"]
         methods = ["ft1", "rewire"]
         seeds = 2
         profile = "quick"
@@ -158,7 +165,7 @@ def test_a_figure_of_the_runs_of_a_campaign(tmp_path, monkeypatch):
             head = json.loads((folder / "settings.json").read_text())
             head |= {"settings": to_json(run.settings)}
             (folder / "settings.json").write_text(json.dumps(head))
-    figure5_evolution.run(FirstTask(campaign=file))
+    figure5_evolution.run(FirstTask(scenario="probe/reach", campaign=file))
     shown = Path("runs/figure5-some/figure5.md").read_text()
     assert "| FT-1 | 2 | 100 | 100 |" in shown
     assert "| FT-1 | 100 / 1,000 | 101 / 1,200 |" in shown

@@ -165,6 +165,7 @@ def test_known_numbers_with_an_uncertain_reference(tmp_path: Path) -> None:
     assert not matrix[2][0].differs_from(0.5)
     assert matrix[0][0] is None
     text = (tmp_path / "report.html").read_text()
+    assert 'href="#progress"' not in text  # All runs are finished.
     bold = re.findall(r"<strong>([\d.]+) \[", text)
     assert sorted(bold) == ["0.00", "0.00", "1.00", "1.00"]
 
@@ -195,6 +196,8 @@ def test_unfinished_failed_and_damaged_runs_are_named(tmp_path: Path) -> None:
     assert seeds == [(0, 2), (1,)]
     assert len(made.sections[0].unfinished) == 2
     text = made.page.read_text()
+    assert "3 of 6 runs are finished" in text
+    assert "<details open>" in text
     for job in (unfinished, failed, damaged):
         assert text.count(f">{job.run.name}</td>") == 2  # in two tables
     assert "error: &lt;b&gt;no disk" in text
@@ -206,6 +209,10 @@ def test_a_campaign_without_results_has_a_page(tmp_path: Path) -> None:
     assert made.sections == ()
     assert made.returns.read_text().count("\n") == 1
     assert {row["state"] for row in rows(made.runs)} == {"missing"}
+    text = made.page.read_text()
+    assert "0 of 6 runs are finished" in text
+    assert 'href="#progress"' in text
+    assert "<details open>" not in text
 
 
 def test_the_page_is_one_file_and_escapes_names(tmp_path: Path) -> None:
