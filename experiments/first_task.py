@@ -20,7 +20,7 @@ from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.titles import heading
 from rewire_jax.reports.training_curve_plot import Curve, evolution
 from rewire_jax.storage.merged_results import merged_curve
-from rewire_jax.storage.run_results import RunData, read_progress, read_run
+from rewire_jax.storage.run_results import RunData, read_progress
 
 READING = (
     "Values are over seeds. Diverged seeds and unfinished runs are left out. The end "
@@ -48,12 +48,11 @@ class FirstTask(suite.Experiment):
     campaign: Path | None = None
     trained_in: Path | None = None
 
-    def folder(self, what: str) -> Path:
-        """The folder of a result."""
+    def name(self, what: str) -> str:
+        """Name of a folder for something made with this budget, or of the campaign."""
         if self.campaign is None:
-            return super().folder(what)
-        parent = suite.RESULTS if self.keep else self.out
-        return parent / f"{what}-{self.campaign.stem}"
+            return super().name(what)
+        return f"{what}-{self.campaign.stem}"
 
     def first_runs(self, variants: suite.Variants) -> list[suite.Run]:
         """A run for each seed and variant, one seed after the other.
@@ -149,10 +148,7 @@ def train(
     else:
         planned = job.first_runs(variants)
         suite.train(planned, job)
-        runs = {
-            run.folder: read_run(run.folder) if run.finished else None
-            for run in planned
-        }
+        runs = {run.folder: run.result for run in planned}
     return read(subject, runs, labels, value)
 
 

@@ -22,7 +22,7 @@ from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import Comparison
 from rewire_jax.reports.table import to_markdown
 from rewire_jax.storage.run_folder import HEADER, TABLES, compare, provenance
-from rewire_jax.storage.run_results import read_run
+from rewire_jax.storage.run_results import RunData, read_run
 from rewire_jax.storage.scores import Success
 from rewire_jax.training.run_setup import prepare
 
@@ -144,9 +144,15 @@ class Run(NamedTuple):
         return self.started and (self.folder / TABLES[0]).exists()
 
     @property
+    def result(self) -> RunData | None:
+        """What it found, if nothing is left to be trained."""
+        run = read_run(self.folder) if self.evaluated else None
+        return run if run and run.complete else None
+
+    @property
     def finished(self) -> bool:
         """Whether nothing is left to be trained."""
-        return self.evaluated and read_run(self.folder).complete
+        return self.result is not None
 
 
 def train(runs: Sequence[Run], job: Job) -> list[Run]:

@@ -60,14 +60,11 @@ class Section:
 
     def pictures(self) -> list[tuple[str, str]]:
         """Title and data URI of each picture."""
-        import matplotlib
+        # Here, because Matplotlib takes long to import.
+        from rewire_jax.reports.plots import plain_text
 
         titles = {**self.report.pictures, "profiles.png": "Performance profiles"}
-        with (
-            TemporaryDirectory() as made,
-            # A name with dollars is no formula.
-            matplotlib.rc_context({"text.parse_math": False}),
-        ):
+        with TemporaryDirectory() as made, plain_text():
             folder = Path(made)
             self.report.draw(folder)
             _draw_profiles(self.report, folder / "profiles.png")

@@ -2,9 +2,11 @@
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -29,9 +31,9 @@ _COLOURS = (
 )
 _STYLES = ("-", "--", ":")
 _ALIKE = 5  # lines of one style
+_TOGETHER = 6  # methods that can be told apart in one panel
 GREY = "; grey: the others"
 """How to read a figure that has a panel for each method."""
-_TOGETHER = 6  # methods that can be told apart in one panel
 
 
 class Draw(Protocol):
@@ -55,6 +57,11 @@ def mean(values: Array) -> Array:
     count = np.sum(~np.isnan(values), axis=0)
     total = np.nansum(values, axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def plain_text() -> AbstractContextManager[None]:
+    """A context in which a name with dollars is no formula."""
+    return rc_context({"text.parse_math": False})
 
 
 def empty(

@@ -67,14 +67,14 @@ class Report(Generic[Numbers]):
             UserError: the folder cannot be written, or has a file of such a name that
                 is of no report.
         """
-        import matplotlib as mpl  # Here, because it takes long.
+        # Here, because Matplotlib takes long to import.
+        from rewire_jax.reports.plots import plain_text
 
         page, *others = self.paths
         with own_files.replacing(page, others) as new:
             for name, text in {self.name: self._markdown(), **self.texts}.items():
                 (new / name).write_text(text, encoding="utf-8")
-            # A name with dollars is no formula.
-            with mpl.rc_context({"text.parse_math": False}):
+            with plain_text():
                 self.draw(new)
 
     def _markdown(self) -> str:

@@ -53,15 +53,16 @@ def curves(
     labels = [each.label for each in trained]
     size = max(9.0, 1.6 * len(tasks)), 5.2
     figure, panels = methods_figure(labels, size, draw)
+    together = len(panels) == 1
+    named = together or len(tasks) <= _NAMED
+    names = tasks if named else [str(k + 1) for k in range(len(tasks))]
     for axes in panels:
         for k in range(len(tasks)):
             axes.axvline(k * budget, color="0.6", linewidth=0.8, zorder=0)
         axes.grid(axis="y", color="0.9")
         axes.set_axisbelow(True)
         if axes.get_subplotspec().is_first_row():  # type: ignore[union-attr]
-            few = len(panels) == 1 or len(tasks) <= _NAMED
-            names = tasks if few else [str(k + 1) for k in range(len(tasks))]
-            _name_tasks(axes, names, budget, 9 if len(panels) == 1 else 6)
+            _name_tasks(axes, names, budget, 9 if together else 6)
     first = panels[0]
     first.set_xlim(0, len(tasks) * budget)
     first.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -73,7 +74,7 @@ def curves(
         low, high = score.limits
         first.set_ylim(low - 0.03 * (high - low), high + 0.03 * (high - low))
     reading = f"lines: {score.trained}, mean over seeds, band from lowest to highest"
-    entitle(figure, title, reading + (GREY if len(panels) > 1 else ""))
+    entitle(figure, title, reading + ("" if together else GREY))
     figure.savefig(path)
 
 

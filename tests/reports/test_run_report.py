@@ -304,6 +304,12 @@ def test_one_seed_shows_no_spread(tmp_path: Path) -> None:
     assert cells(report.page, "Ours (rewire)")["IQM [95% interval]"] == "1,633"
 
 
+def test_a_name_with_dollars_is_no_formula(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / name) for name in (r"$\foo$", "$_{$")]
+    report = write_report(runs, tmp_path / "out")
+    assert all((report.folder / name).exists() for name in report.pictures)
+
+
 def test_out_that_is_a_file(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("")
     with pytest.raises(UserError, match="cannot write"):
