@@ -53,7 +53,7 @@ def sweep_words(out: Path, *more: str, most: int = 12) -> list[str]:
     """What gives the `rewire-jax` command a sweep of the grid, in two batches."""
     words = ["sweep", "probe/reach", *flags(small()), "--out", str(out)]
     words += ["--members-per-batch", str(most)]
-    words += ["--k", *map(str, GRID["modes"]), "--alpha", *map(str, GRID["alpha"])]
+    words += ["--modes", *map(str, GRID["modes"]), "--alpha", *map(str, GRID["alpha"])]
     return [*words, "--axis", "beta", *map(str, GRID["beta"]), *more]
 
 

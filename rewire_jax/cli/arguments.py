@@ -25,7 +25,7 @@ PROG = "rewire-jax"
 _HELP = {"-h", "--help"}
 _EXAMPLE = "halfcheetah/forgetting"  # whose defaults `train --help` shows
 _AXES = {
-    "--k": ("--axis", "modes"),
+    "--modes": ("--axis", "modes"),
     "--alpha": ("--axis", "alpha"),
     "--beta": ("--axis", "beta"),
 }

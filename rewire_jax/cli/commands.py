@@ -66,7 +66,7 @@ class Sweep(Flags):
     """Trains every combination of settings with every seed as one population.
 
     A configuration is one combination. A member is one configuration with one seed. A
-    setting with several values is an axis: `--k 1 2 3`, `--alpha 0 1e-6 1e-5`,
+    setting with several values is an axis: `--modes 1 2 3`, `--alpha 0 1e-6 1e-5`,
     `--beta 0.1 1 10`, and `--axis NAME VALUE...` for other numeric settings of SAC and
     of the method, for example `--axis tau 0.1 1`. All members finish a task before the
     next task starts.

@@ -70,7 +70,7 @@ def test_bad_settings(
         ("list --cache", "--cache"),
         ("sweep probe/reach --out x --axis tau", "--axis"),
         ("sweep probe/reach --out x --axis tau high", "--axis"),
-        ("sweep probe/reach --out x --k 1 --axis modes 2", "modes"),
+        ("sweep probe/reach --out x --modes 1 --axis modes 2", "modes"),
         ("train probe/reach --out=", "--out"),
         ("report --out= x", "--out"),
         ("evaluate x --episodes 999999999999", "--episodes"),

@@ -47,7 +47,7 @@ def test_random_and_halved_from_the_command_line(
 ) -> None:
     # K is kept; of four configurations two and one go on.
     words = sweep_words(tmp_path / "sweep", most=2)
-    words = [*words[: words.index("--k")], "--k", "1", "--beta", "0.1", "10"]
+    words = [*words[: words.index("--modes")], "--modes", "1", "--beta", "0.1", "10"]
     main.main([*words, "--random", "4", "--halving", "2"])
     assert "4 configurations" in " ".join(capsys.readouterr().out.split())
     header = json.loads((tmp_path / "sweep/settings.json").read_text())
