@@ -1,7 +1,7 @@
 """Rewire: multi-mode wirings, their cache, distillation and alignment.
 
 `rewire` builds the method from the functions of this file. The first argument of each
-is its `Design`. The losses are in `rewire_losses.py`.
+is its `Design`. The modes are in `rewire_modes.py`, the losses in `rewire_losses.py`.
 """
 
 from functools import partial
@@ -12,15 +12,22 @@ import jax.numpy as jnp
 from rewire_jax.core.arguments import require
 from rewire_jax.core.pytrees import at, count, put, tile
 from rewire_jax.methods import rewire_alignment, wiring
-from rewire_jax.methods.base import Candidates, Method, Policy, Purpose, Selection
+from rewire_jax.methods.base import Candidates, Method, Policy, Selection
 from rewire_jax.methods.rewire_cloning import with_cloning
 from rewire_jax.methods.rewire_losses import Gaussian, distillation_loss, gaussian_kl
+from rewire_jax.methods.rewire_modes import (
+    distribution,
+    draw_context,
+    draw_extras,
+    forward,
+    hidden,
+    mode_policies,
+)
 from rewire_jax.methods.rewire_settings import DISTILLED_STATES, RewireSettings
 from rewire_jax.methods.rewire_state import Context, Design, Params, State
 from rewire_jax.methods.round import Round
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
-from rewire_jax.nn.wired_layers import wired
 
 Metrics = dict[str, jax.Array]
 
@@ -48,6 +55,7 @@ def rewire(spec: Spec, options: RewireSettings) -> Method:
     method = Method(
         init=partial(init, design),
         start_task=partial(start_task, design),
+        extras=partial(draw_extras, design),
         context=partial(draw_context, design),
         distribution=partial(distribution, design),
         penalty=partial(penalty, design),
@@ -104,60 +112,6 @@ def start_task(
     ), state._replace(head=head, intensity=jnp.ones(()), temperature=jnp.zeros(()))
 
 
-def draw_context(
-    design: Design, key: jax.Array, state: State, purpose: Purpose, extras: object
-) -> Context:
-    """Draws a mode, another mode and, except for acting, noise on scores (Eq. 5)."""
-    del extras
-    modes, shape = design.modes, (design.spec.depth, design.n)
-    mode_key, other_key, noise_key, key = jax.random.split(key, 4)
-    mode = jax.random.randint(mode_key, (), 0, modes)
-    offset = jax.random.randint(other_key, (), 1, jnp.maximum(modes, 2))
-    noise = jnp.zeros(shape)
-    if purpose != "act":
-        noise = design.options.noise * jax.random.gumbel(noise_key, shape)
-        noise *= state.intensity
-    return Context(mode, (mode + offset) % modes, noise, key)
-
-
-def forward(
-    design: Design,
-    params: Params,
-    state: State,
-    scores: jax.Array,
-    key: jax.Array,
-    observation: jax.Array,
-) -> Gaussian:
-    """Returns the wired policy of a mode with `scores` `[L, n]` (Eq. 2)."""
-    activation = networks.ACTIVATIONS[design.spec.network]
-    x, below = observation, None
-    for layer, v in zip(params.hidden, scores, strict=True):
-        key, drop_key = jax.random.split(key)
-        x = wired(layer, v, design.options.tau, x)
-        # The authors drop out before the permutation. Only the variance of the scores'
-        # gradient differs.
-        x = _dropout(drop_key, x, design.options.dropout)
-        x = below = networks.between(activation, x, below)
-    head = at(params.heads, design.head_slot(state))
-    return networks.gaussian(networks.affine(head, x))
-
-
-def distribution(
-    design: Design,
-    params: Params,
-    state: State,
-    context: Context,
-    observation: jax.Array,
-) -> Gaussian:
-    """Returns the policy of the context's mode, with noise on its scores."""
-    scores = params.scores[context.mode]
-    if design.options.mode_rate == "gradient":
-        # Adds exactly 0, so that close scores keep their order.
-        scores += (design.modes - 1) * (scores - jax.lax.stop_gradient(scores))
-    scores += context.noise
-    return forward(design, params, state, scores, context.key, observation)
-
-
 def penalty(
     design: Design,
     key: jax.Array,
@@ -210,17 +164,6 @@ def after_round(
     return params, state
 
 
-def mode_policies(design: Design, params: Params, state: State) -> Policy:
-    """Returns all modes' policies as plain MLPs, stacked on an axis `[mode_slots]`."""
-    head = at(params.heads, design.head_slot(state))
-
-    def folded(scores):
-        orders = jnp.argsort(scores, axis=-1)
-        return [*wiring.fold(params.hidden, orders), head]
-
-    return jax.vmap(folded)(params.scores)
-
-
 def choosing(design: Design, state: State) -> jax.Array:
     """`[]` bool, whether this task's mode is chosen by its return."""
     return (state.learned > 0) | design.options.select_first
@@ -252,14 +195,6 @@ def inspect(
         # Updates need only its gradient, which is cheaper than its value.
         "alignment": rewire_alignment.alignment_term(design, params, state),
     }
-
-
-def hidden(
-    design: Design, params: Params, state: State, observation: jax.Array
-) -> list[jax.Array]:
-    """See `base.Hidden`; of the first mode, without noise and dropout."""
-    first = jax.tree.map(lambda x: x[0], mode_policies(design, params, state))
-    return networks.hidden_of(design.spec.network)(first, observation)
 
 
 def select_order(
@@ -331,10 +266,3 @@ def size(design: Design, params: Params, state: State) -> jax.Array:
     if design.options.alignment == "off":
         stored -= count(params.adapters)
     return stored + count(state.previous) + count(state.head) + state.orders.size
-
-
-def _dropout(key: jax.Array, x: jax.Array, rate: float) -> jax.Array:
-    if rate == 0:
-        return x
-    kept = jax.random.bernoulli(key, 1 - rate, x.shape)
-    return jnp.where(kept, x / (1 - rate), 0.0)

@@ -21,6 +21,9 @@ class RewireSettings:
     Attributes:
       modes: K, the number of wirings that are learned for a task (Eq. 5).
       mode_slots: memory for this many modes, at least `modes`; 0 means `modes`.
+      mode_steps: acting steps between two draws of a mode. With 1, as in the paper,
+        each step draws a mode for all environments. With more, each environment draws
+        a mode of its own at the start of an episode, and after so many steps.
       alpha: weight of the distillation loss. On the published scale, it multiplies a
         sum over 512 states.
       distillation: "kl" is the KL divergence (Eq. 6); "squares" is the authors' sum of
@@ -68,6 +71,7 @@ class RewireSettings:
 
     modes: int = traced(3)
     mode_slots: int = 0
+    mode_steps: int = 1
     alpha: float = 1e-5
     distillation: Literal["kl", "squares"] = "kl"
     beta: float = 1.0
@@ -92,7 +96,7 @@ class RewireSettings:
 
     def checked(self) -> "RewireSettings":
         """Returns the settings with `mode_slots`; `UserError` if one is invalid."""
-        require_counts(self, "modes", "head_slots", "match_every")
+        require_counts(self, "modes", "mode_steps", "head_slots", "match_every")
         require(
             self.mode_slots == 0 or self.mode_slots >= self.modes,
             f"--mode-slots {self.mode_slots} must be at least --modes {self.modes}",

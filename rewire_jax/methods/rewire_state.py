@@ -55,7 +55,7 @@ class Context(NamedTuple):
     """A draw for one update or one acting step, shared by all layers.
 
     Attributes:
-      mode: `[]` int, the wiring to use.
+      mode: `[]` int, the wiring to use; `[envs]` in acting, if environments hold modes.
       other: `[]` int, another mode, the target of the distillation; `mode` if K is 1.
       noise: `[L, n]`, added to the scores of `mode`.
       key: key of dropout.

@@ -17,6 +17,7 @@ from tests.rewired import (
     OBSERVATION,
     OBSERVATIONS,
     SPEC,
+    K,
     N,
     head_at,
     make,
@@ -47,6 +48,40 @@ def test_modes_are_uniform(purpose):
         np.testing.assert_allclose(
             offsets[-others:], 4000 / others, atol=5 * np.sqrt(4000 / others)
         )
+
+
+def test_each_environment_holds_a_mode_of_its_own():
+    every, envs = 4, 3000
+    method = make(mode_steps=every)
+    _, state = method.init(KEY)
+    steps = np.arange(envs) % 7  # they are at different places of their episodes
+    held = np.asarray(method.extras(KEY, state, None, steps))
+    for number in range(9):
+        key = jax.random.fold_in(KEY, number)
+        following = np.asarray(method.extras(key, state, held, steps))
+        draws = steps % every == 0
+        np.testing.assert_array_equal(following[~draws], held[~draws])
+        # A draw is uniform, independent of the mode before and of other environments.
+        pairs = np.bincount(K * held[draws] + following[draws], minlength=K * K)
+        even = draws.sum() / K**2
+        np.testing.assert_allclose(pairs, even, atol=5 * np.sqrt(even))
+        held, steps = following, np.where(steps == 6, 0, steps + 1)
+
+
+def test_an_environment_acts_by_the_mode_it_holds():
+    method, rng = make(mode_steps=4, mode_slots=5), np.random.default_rng(3)
+    params, state = method.init(KEY)
+    params = params._replace(scores=rng.normal(size=params.scores.shape))
+    modes = np.array([2, 0, 1, 1, 0, 2, 2])
+    for purpose in ("critic", "policy"):  # updates draw one mode for the batch
+        assert np.shape(method.context(KEY, state, purpose, modes).mode) == ()
+    context = method.context(KEY, state, "act", modes)
+    mean, log_std = method.distribution(params, state, context, OBSERVATION)
+    policies = method.candidates(params, state, 0).policies
+    for place, mode in enumerate(modes):
+        own = jax.tree.map(lambda x, mode=mode: x[mode], policies)
+        expected = method.act(own, OBSERVATION[place])
+        np.testing.assert_allclose((mean[place], log_std[place]), expected, rtol=1e-5)
 
 
 def test_noise_is_gumbel_and_only_in_learning():
