@@ -69,11 +69,13 @@ class ScenarioTask:
       name: the task's name.
       distinct: index among the scenario's distinct tasks, from 0.
       data: the environment's input; if the task recurs, the same object.
+      change: what `data` was made from; None if it was made in another way.
     """
 
     name: str
     distinct: int
     data: Task
+    change: TaskChange | None = None
 
     @property
     def action_scale(self) -> np.ndarray:
@@ -147,7 +149,7 @@ def make_scenario(
     changes = {change.name: change for change in spec.changes}
     data = {name: domain.make_task(changes[name]) for name in names}
     once = [
-        ScenarioTask(change.name, names.index(change.name), data[change.name])
+        ScenarioTask(change.name, names.index(change.name), data[change.name], change)
         for change in spec.changes
     ]
     return Scenario(

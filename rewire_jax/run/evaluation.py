@@ -14,7 +14,7 @@ from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.methods import METHODS, find_method
 from rewire_jax.methods.base import Selection
 from rewire_jax.methods.spec import Spec
-from rewire_jax.run import episode_parts, header_check, run_checkpoints, task_choice
+from rewire_jax.run import episode_parts, run_checkpoints, task_choice, task_header
 from rewire_jax.run.run_checkpoints import saved
 from rewire_jax.run.task_choice import Choice, Trials
 from rewire_jax.storage import run_folder
@@ -155,7 +155,7 @@ def evaluate(
     )
     header, settings = saved(folder)
     plan = prepare(settings)
-    header_check.check_tasks(folder, header, plan)
+    task_header.check_tasks(folder, header, plan)
     stage = run_checkpoints.latest(folder) if stage is None else stage
     policies, active = _policies(folder, stage, plan)
     choice = None

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.methods import METHODS
@@ -15,7 +14,6 @@ from rewire_jax.storage.json_lines import reading
 from rewire_jax.storage.sweep_results import each_batch
 from rewire_jax.training import population
 from rewire_jax.training.population import Member
-from rewire_jax.training.run_setup import Plan
 
 
 def check_header(folder: Path) -> None:
@@ -65,20 +63,3 @@ def _parts(
         count, tasks = len(header["members"]), len(header["tasks"])
     for _, place, numbers in each_batch(folder, count, tasks):
         yield place, numbers
-
-
-def check_tasks(folder: Path, header: Mapping[str, Any], plan: Plan) -> None:
-    """Raises `UserError` if a folder's run or sweep had other tasks than the plan.
-
-    Args:
-      folder: the folder.
-      header: its header.
-      plan: what is to be done with it.
-    """
-    length = plan.scenario.environment.episode_length
-    same = header.get("tasks") == list(plan.names)
-    require(
-        same and header.get("episode_length") == length,
-        f"{folder} was trained on other tasks than {plan.scenario.name} has now: name "
-        "another --out, or restore the scenario",
-    )

@@ -28,11 +28,11 @@ from rewire_jax.core.formatting import short
 from rewire_jax.core.settings import Settings
 from rewire_jax.envs.scenarios import Scenario
 from rewire_jax.run import (
-    header_check,
     loggers,
     run_checkpoints,
     run_state,
     sweep_members,
+    task_header,
 )
 from rewire_jax.run.interrupts import Stopped, interruptible
 from rewire_jax.run.loggers import Loggers
@@ -311,7 +311,7 @@ def sweep(
             stack.enter_context(run_folder.held(folder, start, "sweep"))
         run_folder.compare(folder, plan.settings, "sweep")
         saved = run_folder.read_header(folder, "sweep")
-        header_check.check_tasks(folder, saved, plan)
+        task_header.check_tasks(folder, saved, plan)
         require(
             all(saved[name] == header[name] for name in ("members", "halving")),
             f"{folder} was started with other axes, seeds or halving: repeat them or "

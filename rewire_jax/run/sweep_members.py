@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from rewire_jax.core.errors import UserError
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.settings_json import to_json
-from rewire_jax.run import run_checkpoints
+from rewire_jax.run import run_checkpoints, task_header
 from rewire_jax.run.sweep_grid import describe, make_members, values_of
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.json_lines import reading
@@ -76,9 +76,8 @@ def make_header(
         "axes": axes or values_of(told),
         **asked,
         "members": told,
-        "tasks": plan.names,
+        **task_header.header_of_tasks(plan),
         "spec": plan.spec._asdict(),
-        "episode_length": plan.scenario.environment.episode_length,
         "provenance": run_folder.provenance(),
     }
 

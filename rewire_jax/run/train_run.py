@@ -7,7 +7,7 @@ from pathlib import Path
 from rewire_jax.core.settings import Settings
 from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import Scenario
-from rewire_jax.run import header_check, loggers, run_checkpoints
+from rewire_jax.run import loggers, run_checkpoints, task_header
 from rewire_jax.run.detecting_run import DetectingRun
 from rewire_jax.run.interrupts import interruptible
 from rewire_jax.run.loggers import Loggers
@@ -53,9 +53,8 @@ def train(
     memory_estimate.check(plan)
     header = {
         "settings": to_json(plan.settings),
-        "tasks": plan.names,
+        **task_header.header_of_tasks(plan),
         "spec": plan.spec._asdict(),
-        "episode_length": plan.scenario.environment.episode_length,
         "provenance": run_folder.provenance(),
     }
     label = f"{settings.method} on {settings.scenario}"
@@ -63,7 +62,7 @@ def train(
         stack.enter_context(run_folder.held(folder, None if resume else header))
         if resume:
             run_folder.compare(folder, plan.settings)
-            header_check.check_tasks(folder, run_folder.read_header(folder), plan)
+            task_header.check_tasks(folder, run_folder.read_header(folder), plan)
         display = stack.enter_context(
             progress(
                 plan.names, plan.interactions, [m.name for m in plan.members], label
