@@ -32,27 +32,16 @@ _REPORT, _CHECKPOINT = 12_800, 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class FirstTask(suite.Experiment):
+class FirstTask(suite.OfCampaign):
     """What to run.
 
     Attributes:
       scenario: name of the scenario.
       tasks: number of tasks to train; only the first task is shown.
-      campaign: TOML file of a campaign whose configurations have the variants' names;
-        its runs are shown, and nothing is trained.
-      trained_in: folder of the campaign; by default runs/ and the name of the file.
     """
 
     scenario: str = "halfcheetah/forgetting"
     tasks: int = 1
-    campaign: Path | None = None
-    trained_in: Path | None = None
-
-    def name(self, what: str) -> str:
-        """Name of a folder for something made with this budget, or of the campaign."""
-        if self.campaign is None:
-            return super().name(what)
-        return f"{what}-{self.campaign.stem}"
 
     def first_runs(self, variants: suite.Variants) -> list[suite.Run]:
         """A run for each seed and variant, one seed after the other.

@@ -126,6 +126,26 @@ class Experiment(Job):
         ]
 
 
+@dataclass(frozen=True, kw_only=True)
+class OfCampaign(Experiment):
+    """How to run, or which runs of a campaign to show instead.
+
+    Attributes:
+      campaign: TOML file of a campaign whose configurations have the names of the
+        experiment's runs; its runs are shown, and nothing is trained.
+      trained_in: folder of the campaign; by default runs/ and the name of the file.
+    """
+
+    campaign: Path | None = None
+    trained_in: Path | None = None
+
+    def name(self, what: str) -> str:
+        """Name of a folder for something made with this budget, or of the campaign."""
+        if self.campaign is None:
+            return super().name(what)
+        return f"{what}-{self.campaign.stem}"
+
+
 class Run(NamedTuple):
     """A run of an experiment: its folder, scenario and settings."""
 

@@ -115,10 +115,10 @@ _DOMAINS = {
 }
 ABLATION = {
     "ft_l2": Figures(0.67, 0.32),
-    "rewire-uncached": Figures(0.76, 0.29),
-    "rewire-cached": Figures(0.95, 0.24),
-    "rewire-modes": Figures(1.14, 0.22),
-    "rewire-aligned": Figures(1.15, 0.25),
+    "rewire-without-caching-modes-alignment": Figures(0.76, 0.29),
+    "rewire-without-modes-alignment": Figures(0.95, 0.24),
+    "rewire-without-alignment": Figures(1.14, 0.22),
+    "rewire-without-modes": Figures(1.15, 0.25),
     "rewire": Figures(1.31, 0.21),
 }
 """Table 3, on halfcheetah/forgetting, from FT-L2 to all designs together."""

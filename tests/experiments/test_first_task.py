@@ -54,7 +54,7 @@ def test_figure3_of_a_real_run(tmp_path, monkeypatch):
         assert divergence["0", "640"] != divergence["1", "640"]
         assert min(divergence["0", "640"], divergence["1", "640"]) > 0
     shown = path.with_suffix(".md").read_text()
-    assert "1 of 4 tasks, 640 interactions a task" in shown
+    assert "1 of 4 tasks, reduced budget of 640 interactions a task" in shown
     assert shown.count("of 2 seeds") == 2
 
 

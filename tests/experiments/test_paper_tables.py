@@ -14,6 +14,8 @@ from rewire_jax.core.errors import UserError
 from rewire_jax.reports import paper_results
 from tests.fake_run import EDGE, GAP, SCORES, rows
 from tests.fake_training import NAMES
+from tests.reports.test_campaign_report import SCORES as CAMPAIGN_SCORES
+from tests.reports.test_campaign_report import TEXT, write_file, write_runs
 
 
 def performance(factor):
@@ -134,16 +136,66 @@ def test_table3_turns_the_designs_on_one_by_one(trained, tmp_path):
         for name in list(table3_ablation.ROWS)[1:]
     }
     assert designs == {
-        "rewire-uncached": (False, 1, "off"),
-        "rewire-cached": (True, 1, "off"),
-        "rewire-modes": (True, 3, "off"),
-        "rewire-aligned": (True, 1, "expanded"),
+        "rewire-without-caching-modes-alignment": (False, 1, "off"),
+        "rewire-without-modes-alignment": (True, 1, "off"),
+        "rewire-without-alignment": (True, 3, "off"),
+        "rewire-without-modes": (True, 1, "expanded"),
         "rewire": (True, 3, "expanded"),
     }
-    for name in ("rewire-uncached", "rewire-cached", "rewire-modes"):
+    for name in (
+        "rewire-without-caching-modes-alignment",
+        "rewire-without-modes-alignment",
+        "rewire-without-alignment",
+    ):
         assert options[name].beta == options["ft_l2"].coefficient == 1e4
-    assert options["rewire-aligned"].beta == options["rewire"].beta == 100
+    assert options["rewire-without-modes"].beta == options["rewire"].beta == 100
     found = rows(tmp_path / "table3-quick" / "table3.csv")
     assert [row["performance"] for row in found] == ["1.0"] * 6
     published = [float(row["paper_performance"]) for row in found]
     assert published == [0.67, 0.76, 0.95, 1.14, 1.15, 1.31]
+
+
+def test_table3_of_a_campaign(trained, tmp_path):
+    text = f"""{TEXT}
+[[runs]]
+scenarios = ["probe/reach"]
+methods = ["rewire"]
+name = "rewire without modes, alignment"
+profile = "quick"
+seeds = 2
+[runs.settings]
+tasks = 2
+modes = 1
+alignment = "off"
+"""
+    file = write_file(tmp_path / "made", "rewire", text=text)
+    job = Table3(
+        scenario="probe/reach", campaign=file, trained_in=file.parent, out=tmp_path
+    )
+    with pytest.raises(UserError, match=r"made/campaign\.toml on probe/reach"):
+        table3_ablation.run(job)
+    write_runs(file)
+    with pytest.raises(UserError, match="SAC-N"):
+        table3_ablation.run(job)
+    file = write_file(tmp_path / "whole", "rewire", "sac_n", text=text)
+    write_runs(file)
+    job = dataclasses.replace(job, campaign=file, trained_in=file.parent)
+    with pytest.raises(UserError, match="on probe/other"):
+        table3_ablation.run(dataclasses.replace(job, scenario="probe/other"))
+    table3_ablation.run(job)
+    assert not trained
+    found = {
+        row["run"]: row for row in rows(tmp_path / "table3-campaign" / "table3.csv")
+    }
+    assert list(found) == list(table3_ablation.ROWS)
+    # Each further seed scores 200 more in every task.
+    ours, unit = (CAMPAIGN_SCORES[name][-1].mean() for name in ("rewire", "sac_n"))
+    single = found["rewire-without-modes-alignment"]
+    assert (found["rewire"]["seeds"], single["seeds"]) == ("3", "2")
+    assert float(found["rewire"]["performance"]) == pytest.approx(
+        (ours + 200) / (unit + 200)
+    )
+    assert float(single["performance"]) == pytest.approx((ours + 100) / (unit + 200))
+    assert float(single["paper_performance"]) == 0.95
+    assert found["rewire-without-modes"]["performance"] == ""
+    assert float(single["iqm_low"]) < float(single["iqm"]) < float(single["iqm_high"])
