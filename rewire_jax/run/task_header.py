@@ -49,12 +49,9 @@ def check_tasks(folder: Path, header: Mapping[str, Any], plan: Plan) -> None:
       plan: what is to be done with it.
     """
     now = header_of_tasks(plan)
-    before = {name: header.get(name) for name in now}
-    if "changes" not in header:  # it was written by an older version
-        before["changes"] = now["changes"]
-    # As text, because NaN is not equal to itself.
+    before = {"changes": now["changes"]} | dict(header)  # older headers have none
     require(
-        json.dumps(before, sort_keys=True) == json.dumps(now, sort_keys=True),
+        all(before.get(name) == value for name, value in now.items()),
         f"{folder} was trained on other tasks than {plan.scenario.name} has now: name "
         "another --out, or restore the scenario",
     )

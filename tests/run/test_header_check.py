@@ -172,9 +172,13 @@ def test_other_tasks_under_the_same_names(tmp_path: Path) -> None:
     for other in (reach(0.9), reach(0.8, hidden=0.5)):
         with pytest.raises(UserError, match="other tasks"):
             rewire_jax.train(settings, folder, scenario=other, resume=True)
+    far = rewire_jax.train(settings, tmp_path / "far", scenario=reach(0.9))
+    with pytest.raises(UserError, match="other tasks"):
+        write_report([folder, far], tmp_path / "report")
     # Older versions did not write how tasks differ from their domain.
     older = changed(folder, tmp_path / "older", lambda header: header.pop("changes"))
     rewire_jax.train(settings, older, scenario=reach(0.9), resume=True)
+    write_report([older, far], tmp_path / "report")
 
 
 def test_other_names_of_tasks(trained: dict[str, Path], tmp_path: Path) -> None:
