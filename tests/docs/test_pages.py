@@ -49,6 +49,8 @@ def shrunk(run: Callable[..., Any]) -> Callable[..., Any]:
 def newcomer(tmp_path: Path, monkeypatch):
     """An empty folder, training of seconds, and registries that are restored."""
     monkeypatch.chdir(tmp_path)
+    preset = rewire_jax.preset
+    monkeypatch.setattr(rewire_jax, "preset", lambda *args: small(preset(*args)))
     monkeypatch.setattr(rewire_jax, "train", shrunk(rewire_jax.train))
     monkeypatch.setattr(rewire_jax, "sweep", shrunk(rewire_jax.sweep))
     monkeypatch.setattr(rewire_jax, "make_train", shrunk(rewire_jax.make_train))
