@@ -6,16 +6,17 @@ is also trained, because scores are divided by its performance. With --campaign,
 runs are those of a campaign.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import rewire_jax
 from experiments import averages, suite
-from rewire_jax.core.arguments import require
+from rewire_jax.core.errors import UserError
 from rewire_jax.reports import paper_results
 from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import Comparison, Summary
+from rewire_jax.run.campaign_file import slug
 
 READING = (
     "Performance is the return after the last task, averaged over tasks and divided by "
@@ -67,47 +68,48 @@ def variants(job: Table3) -> suite.Variants:
     }
 
 
-def report(job: Table3, out: Path) -> Report[Comparison]:
-    """The runs, trained or of the campaign, as their report has them.
+def report(job: Table3, out: Path) -> tuple[Report[Comparison], dict[str, Summary]]:
+    """The report on the runs, trained or of the campaign, and its rows by name.
 
     Raises:
-      UserError: as `suite.train` does; or no run of the campaign is finished.
+      UserError: as `suite.train` does; or the campaign has no finished run for this.
     """
     if job.campaign is None:
         runs = suite.train(job.runs(job.scenario, variants(job)), job)
-        return suite.reports(runs, out)[0]
-    sections = rewire_jax.write_campaign_report(job.campaign, job.trained_in).sections
-    found = [
-        section.report
-        for section in sections
-        if section.report.numbers.summaries[0].run.settings["scenario"] == job.scenario
-    ]
-    require(bool(found), f"no run of {job.campaign} on {job.scenario} is finished")
-    return found[0]
+        (made,) = suite.reports(runs, out)
+        names = [summary.run.folder.name for summary in made.numbers.summaries]
+        return made, dict(zip(names, made.numbers.summaries, strict=True))
+    whole = rewire_jax.write_campaign_report(job.campaign, job.trained_in)
+    for section in whole.sections:
+        names = [slug(name) for name in section.names]
+        found = dict(zip(names, section.report.numbers.summaries, strict=True))
+        scenario = found[names[0]].run.settings["scenario"]
+        if scenario == job.scenario and "sac_n" in found:
+            notes = (*section.unfinished, *section.report.notes)
+            return replace(section.report, notes=notes), found
+    raise UserError(
+        f"{job.campaign} has no finished run of SAC-N on {job.scenario}, by which "
+        "scores are divided"
+    )
 
 
 def run(job: Table3) -> None:
     """Trains what is unfinished, and writes the table; raises as `report`."""
     out = job.folder("table3")
-    made = report(job, out)
-    require(not made.numbers.raw, "no run of SAC-N is finished, and scores need it")
-    found = {
-        summary.run.folder.name: summary
-        for summary in made.numbers.summaries
-        if summary.run.complete and summary.performance.values
-    }
+    made, found = report(job, out)
+    shown = {} if made.numbers.raw else found
     head = ["rewire", "multi-mode", "alignment", "performance", "IQM [95% interval]"]
     table, rows = [[*head, "model size", "seeds", "paper"]], []
     for name, marks in ROWS.items():
-        ours, paper = found.get(name), paper_results.ABLATION[name]
+        ours, paper = shown.get(name), paper_results.ABLATION[name]
+        if ours and not (ours.run.complete and ours.performance.values):
+            ours = None
         table.append([*marks, *cells(ours), averages.text(paper)])
         row = {"run": name} | columns(ours)
         rows.append(row | averages.columns("paper_", paper))
-    notes = (
-        READING,
-        "",
-        *(origin(found[name].label, found[name].run) for name in ROWS if name in found),
-    )
+    used = [found[name] for name in ("sac_n", *ROWS) if name in found]
+    notes = [f"**{note}**" for note in made.notes]
+    notes += ["", READING, "", *(origin(each.label, each.run) for each in used)]
     suite.write(out / "table3", f"Table 3 on {made.title}", table, notes, rows)
 
 

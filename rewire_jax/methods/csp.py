@@ -20,6 +20,7 @@ from rewire_jax.methods.base import (
     Tools,
 )
 from rewire_jax.methods.csp_settings import CspSettings
+from rewire_jax.methods.held_extras import held
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.nn.networks import Linear
@@ -134,11 +135,7 @@ def draw_extras(
         from_new(design, new_key, state, steps.shape),
         from_former(design, former_key, state, steps.shape),
     )
-    if extras is None:
-        return drawn
-    # An episode's first step, number 0, is among these.
-    due = steps % design.options.resample_every == 0
-    return jnp.where(due[:, None], drawn, extras)
+    return held(extras, drawn, steps, design.options.resample_every)
 
 
 def draw_context(

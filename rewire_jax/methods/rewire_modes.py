@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from rewire_jax.core.pytrees import at
 from rewire_jax.methods import wiring
 from rewire_jax.methods.base import Extras, Policy, Purpose
+from rewire_jax.methods.held_extras import held
 from rewire_jax.methods.rewire_losses import Gaussian
 from rewire_jax.methods.rewire_state import Context, Design, Params, State
 from rewire_jax.nn import networks
@@ -23,10 +24,7 @@ def draw_extras(
     if design.options.mode_steps == 1:
         return ()
     drawn = jax.random.randint(key, steps.shape, 0, design.modes)
-    if extras is None:
-        return drawn
-    # An episode's first step, number 0, is among these.
-    return jnp.where(steps % design.options.mode_steps == 0, drawn, extras)
+    return held(extras, drawn, steps, design.options.mode_steps)
 
 
 def draw_context(
@@ -56,7 +54,11 @@ def distribution(
     context: Context,
     observation: jax.Array,
 ) -> Gaussian:
-    """Returns the policy of the context's mode, with noise on its scores."""
+    """Returns mean and log-std `[batch, actions]` of the context's mode.
+
+    Its scores have the context's noise. If the environments hold modes of their own,
+    each row is that of its environment's mode.
+    """
     if jnp.ndim(context.mode):
         return held_modes(design, params, state, context, observation)
     scores = params.scores[context.mode]
@@ -74,7 +76,7 @@ def held_modes(
     context: Context,
     observation: jax.Array,
 ) -> Gaussian:
-    """Returns for each environment the policy of the mode that it holds."""
+    """Returns mean and log-std `[envs, actions]` of the mode that each one holds."""
 
     def of_mode(scores):
         return forward(design, params, state, scores, context.key, observation)

@@ -56,7 +56,7 @@ class Context(NamedTuple):
 
     Attributes:
       mode: `[]` int, the wiring to use; `[envs]` in acting, if environments hold modes.
-      other: `[]` int, another mode, the target of the distillation; `mode` if K is 1.
+      other: like `mode`, another one, the target of the distillation; `mode` if K is 1.
       noise: `[L, n]`, added to the scores of `mode`.
       key: key of dropout.
     """

@@ -15,6 +15,7 @@ from rewire_jax.envs.scenarios import Scenario, make_scenario
 from rewire_jax.run import run_checkpoints, sweep_members
 from rewire_jax.run.policies import PolicyFunction, load_policy
 from rewire_jax.run.run_checkpoints import saved
+from rewire_jax.run.task_header import check_tasks
 from rewire_jax.storage import checkpoint, run_folder
 
 
@@ -87,7 +88,7 @@ def render(
     check_whole("--episode", episode)
     act = load_policy(run, task=task, seed=seed, stage=stage, member=member)
     folder = Path(run)
-    _, settings = saved(folder, run_folder.kind(folder))
+    header, settings = saved(folder, run_folder.kind(folder))
     learned = _learned(folder, member) if stage is None else stage + 1
     require(
         task < learned or stage is not None,
@@ -95,6 +96,7 @@ def render(
         f"add --stage {learned - 1}",
     )
     scenario = make_scenario(settings.scenario, settings.backend, settings.reward)
+    check_tasks(folder, header, scenario, settings.tasks)
     played = _play(scenario, scenario.tasks[task].data, act, episode)
     if member is None:
         who = f"seed {settings.seed if seed is None else seed}"

@@ -17,6 +17,7 @@ from rewire_jax.reports.run_summary import (
     final_samples,
     summarize,
 )
+from rewire_jax.reports.same_tasks import check_same_tasks
 from rewire_jax.reports.spread import Interval
 from rewire_jax.reports.statistics import Array, estimate, stratified_bootstrap
 from rewire_jax.reports.table import Table
@@ -40,12 +41,14 @@ class Section:
 
     Attributes:
         report: tables and pictures, as the report of runs has them.
+        names: of the configurations, in the order of the tables.
         unfinished: a sentence for each configuration that lacks seeds.
         improvement: for each pair of configurations the probability that the first one
             is better; None for a configuration with itself, or without scores.
     """
 
     report: Report[Comparison]
+    names: tuple[str, ...]
     unfinished: tuple[str, ...]
     improvement: tuple[tuple[Interval | None, ...], ...]
 
@@ -97,6 +100,7 @@ def sections(data: CampaignData) -> list[Section]:
     groups: dict[tuple[object, ...], dict[str, RunData]] = defaultdict(dict)
     for scenario, name in planned:
         if (scenario, name) in runs:
+            check_same_tasks(runs[scenario, name])
             run = merged(runs[scenario, name])
             groups[comparable(run)][name] = run
     return [_section(group, planned) for group in groups.values()]
@@ -123,6 +127,7 @@ def _section(group: dict[str, RunData], planned: Counter[tuple[str, str]]) -> Se
                 pairs[j][i] = _complement(pairs[i][j])
     return Section(
         report=run_report.make(comparison, first.folder.parent),
+        names=tuple(group),
         unfinished=tuple(unfinished),
         improvement=tuple(map(tuple, pairs)),
     )

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rewire_jax.core.arguments import require
 from rewire_jax.core.errors import UserError
 from rewire_jax.reports import metrics, paper_results, statistics
 from rewire_jax.reports.paper_results import Figures, Source
+from rewire_jax.reports.same_tasks import check_same_tasks
 from rewire_jax.reports.spread import Interval, Spread, spread
 from rewire_jax.reports.statistics import estimate
 from rewire_jax.storage.run_results import RunData
@@ -144,17 +146,13 @@ def summarize(
         UserError: there is no run, one is given twice, they are not comparable, or a
             task lacks its single-task run.
     """
-    if not runs:
-        raise UserError("no run to report on: name the folder of one or more")
+    require(bool(runs), "no run to report on: name the folder of one or more")
     first = runs[0]
     for run in runs[1:]:
         _check(run, first, *_SHARED)
-        # Headers of older versions do not say how tasks differ from their domain.
-        changes = [r.header["changes"] for r in (run, first) if "changes" in r.header]
-        if run.tasks != first.tasks or changes[1:] not in ([], changes[:1]):
-            raise UserError(
-                f"cannot compare {run.folder} with {first.folder}: other tasks"
-            )
+        same = run.tasks == first.tasks
+        require(same, f"cannot compare {run.folder} with {first.folder}: other tasks")
+    check_same_tasks([*runs, *single])
     areas = _alone(single, first)
     base, raw = _reference(runs) if first.score.normalised else (None, None)
     sources = paper_results.sources(

@@ -155,7 +155,7 @@ def evaluate(
     )
     header, settings = saved(folder)
     plan = prepare(settings)
-    task_header.check_tasks(folder, header, plan)
+    task_header.check_tasks(folder, header, plan.scenario, len(plan.names))
     stage = run_checkpoints.latest(folder) if stage is None else stage
     policies, active = _policies(folder, stage, plan)
     choice = None

@@ -311,7 +311,7 @@ def sweep(
             stack.enter_context(run_folder.held(folder, start, "sweep"))
         run_folder.compare(folder, plan.settings, "sweep")
         saved = run_folder.read_header(folder, "sweep")
-        task_header.check_tasks(folder, saved, plan)
+        task_header.check_tasks(folder, saved, plan.scenario, len(plan.names))
         require(
             all(saved[name] == header[name] for name in ("members", "halving")),
             f"{folder} was started with other axes, seeds or halving: repeat them or "

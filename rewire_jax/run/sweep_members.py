@@ -76,7 +76,7 @@ def make_header(
         "axes": axes or values_of(told),
         **asked,
         "members": told,
-        **task_header.header_of_tasks(plan),
+        **task_header.header_of_tasks(plan.scenario, len(plan.names)),
         "spec": plan.spec._asdict(),
         "provenance": run_folder.provenance(),
     }

@@ -53,7 +53,7 @@ def train(
     memory_estimate.check(plan)
     header = {
         "settings": to_json(plan.settings),
-        **task_header.header_of_tasks(plan),
+        **task_header.header_of_tasks(plan.scenario, len(plan.names)),
         "spec": plan.spec._asdict(),
         "provenance": run_folder.provenance(),
     }
@@ -62,7 +62,9 @@ def train(
         stack.enter_context(run_folder.held(folder, None if resume else header))
         if resume:
             run_folder.compare(folder, plan.settings)
-            task_header.check_tasks(folder, run_folder.read_header(folder), plan)
+            task_header.check_tasks(
+                folder, run_folder.read_header(folder), plan.scenario, len(plan.names)
+            )
         display = stack.enter_context(
             progress(
                 plan.names, plan.interactions, [m.name for m in plan.members], label

@@ -80,6 +80,7 @@ def read_header(folder: Path, kind: str) -> Results:
         dict(header["provenance"].get("versions", {}))  # as pages show them
         fields.checked(header["settings"], fields.SETTINGS)
         fields.checked(header, fields.HEADER)
+        known_changes(header)
         results = Results(
             folder=folder,
             settings=dict(header["settings"]),
@@ -89,6 +90,16 @@ def read_header(folder: Path, kind: str) -> Results:
             header=header,
         )
     return results
+
+
+def known_changes(header: Mapping[str, Any]) -> dict[str, Any]:
+    """How tasks differ from their domain, by their names, as far as a header says it.
+
+    Headers of older versions do not; and a scenario may be made without `TaskChange`.
+    """
+    changes = header.get("changes") or [None] * len(header["tasks"])
+    pairs = zip(header["tasks"], changes, strict=True)
+    return {name: change for name, change in pairs if change is not None}
 
 
 def check_tables(folder: Path) -> None:

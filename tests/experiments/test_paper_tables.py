@@ -155,47 +155,50 @@ def test_table3_turns_the_designs_on_one_by_one(trained, tmp_path):
     assert published == [0.67, 0.76, 0.95, 1.14, 1.15, 1.31]
 
 
-def test_table3_of_a_campaign(trained, tmp_path):
+@pytest.mark.parametrize(
+    ("population", "seeds"), [("never", 2), ("never", 1), ("always", 2)]
+)
+def test_table3_of_a_campaign(population, seeds, trained, tmp_path):
     text = f"""{TEXT}
 [[runs]]
 scenarios = ["probe/reach"]
 methods = ["rewire"]
 name = "rewire without modes, alignment"
 profile = "quick"
-seeds = 2
+seeds = {seeds}
 [runs.settings]
 tasks = 2
 modes = 1
 alignment = "off"
 """
-    file = write_file(tmp_path / "made", "rewire", text=text)
-    job = Table3(
-        scenario="probe/reach", campaign=file, trained_in=file.parent, out=tmp_path
-    )
-    with pytest.raises(UserError, match=r"made/campaign\.toml on probe/reach"):
-        table3_ablation.run(job)
-    write_runs(file)
-    with pytest.raises(UserError, match="SAC-N"):
-        table3_ablation.run(job)
-    file = write_file(tmp_path / "whole", "rewire", "sac_n", text=text)
-    write_runs(file)
-    job = dataclasses.replace(job, campaign=file, trained_in=file.parent)
-    with pytest.raises(UserError, match="on probe/other"):
-        table3_ablation.run(dataclasses.replace(job, scenario="probe/other"))
+    made = tmp_path / "made"
+    file = write_file(made, "rewire", "sac_n", text=text, population=population)
+    write_runs(file, population == "always")
+    job = Table3(scenario="probe/reach", campaign=file, trained_in=made, out=tmp_path)
     table3_ablation.run(job)
     assert not trained
-    found = {
-        row["run"]: row for row in rows(tmp_path / "table3-campaign" / "table3.csv")
-    }
+    path = tmp_path / "table3-campaign" / "table3.csv"
+    found = {row["run"]: row for row in rows(path)}
     assert list(found) == list(table3_ablation.ROWS)
     # Each further seed scores 200 more in every task.
     ours, unit = (CAMPAIGN_SCORES[name][-1].mean() for name in ("rewire", "sac_n"))
-    single = found["rewire-without-modes-alignment"]
-    assert (found["rewire"]["seeds"], single["seeds"]) == ("3", "2")
-    assert float(found["rewire"]["performance"]) == pytest.approx(
-        (ours + 200) / (unit + 200)
-    )
-    assert float(single["performance"]) == pytest.approx((ours + 100) / (unit + 200))
+    whole, single = found["rewire"], found["rewire-without-modes-alignment"]
+    assert (whole["seeds"], single["seeds"]) == ("3", str(seeds))
+    assert float(whole["performance"]) == pytest.approx((ours + 200) / (unit + 200))
+    mean = ours + 100 * (seeds - 1)
+    assert float(single["performance"]) == pytest.approx(mean / (unit + 200))
     assert float(single["paper_performance"]) == 0.95
     assert found["rewire-without-modes"]["performance"] == ""
-    assert float(single["iqm_low"]) < float(single["iqm"]) < float(single["iqm_high"])
+    assert float(whole["iqm_low"]) < float(whole["iqm"]) < float(whole["iqm_high"])
+    # All scores are divided by those of SAC-N, so it is named, too.
+    assert "- SAC-N: " in path.with_suffix(".md").read_text()
+
+
+def test_table3_of_a_campaign_without_sac_n(tmp_path):
+    file = write_file(tmp_path / "made", "rewire")
+    job = Table3(scenario="probe/reach", campaign=file, trained_in=file.parent)
+    for _ in range(2):
+        with pytest.raises(UserError, match="SAC-N on probe/reach"):
+            table3_ablation.run(job)
+        if not list(file.parent.glob("probe/**/settings.json")):
+            write_runs(file)

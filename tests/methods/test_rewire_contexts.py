@@ -52,7 +52,7 @@ def test_modes_are_uniform(purpose):
 
 def test_each_environment_holds_a_mode_of_its_own():
     every, envs = 4, 3000
-    method = make(mode_steps=every)
+    method = make(mode_steps=every, mode_slots=5)
     _, state = method.init(KEY)
     steps = np.arange(envs) % 7  # they are at different places of their episodes
     held = np.asarray(method.extras(KEY, state, None, steps))

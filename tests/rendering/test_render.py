@@ -18,6 +18,7 @@ from rewire_jax.core.settings_json import to_json
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.rendering import render
 from rewire_jax.run import run_checkpoints, run_state
+from rewire_jax.run.task_header import header_of_tasks
 from rewire_jax.storage import run_folder
 from rewire_jax.storage.sweep_results import batch, batches_of
 from rewire_jax.training.run_setup import prepare
@@ -49,7 +50,7 @@ def untrained(folder: Path, scenario: str, *, stage: int = 2, **more) -> Path:
     plan = prepare(settings)
     header = {
         "settings": to_json(plan.settings),
-        "tasks": list(plan.names),
+        **header_of_tasks(plan.scenario, settings.tasks) | {"episode_length": STEPS},
         "spec": plan.spec._asdict(),
         **more,
     }

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import rewire_jax
-from rewire_jax import ScenarioSpec, TaskChange, UserError, make_scenario, write_report
-from rewire_jax.envs.scenarios import Scenario
+from rewire_jax import UserError, write_report
 from rewire_jax.run.header_check import check_header
 from tests.small_sweep import run_sweep, small
 
@@ -154,31 +153,6 @@ def test_numbers_may_be_of_any_kind(tmp_path: Path) -> None:
         header["settings"]["options"]["beta"] = 100
 
     write_report(changed(folder, tmp_path / "copy", shorten), tmp_path / "report")
-
-
-def test_other_tasks_under_the_same_names(tmp_path: Path) -> None:
-    def reach(x: object, hidden: float = 0.0) -> Scenario:
-        changes = (
-            TaskChange("near", extra={"goal": (0.1, 0.0)}, hidden=hidden),
-            TaskChange("far", extra={"goal": (x, 0.8)}),
-        )
-        return make_scenario(ScenarioSpec("probe/ours", "reach", changes, 1, 640))
-
-    settings = dataclasses.replace(small(seeds=1), scenario="probe/ours", tasks=2)
-    folder = rewire_jax.train(settings, tmp_path / "run", scenario=reach(0.8))
-    # However they are written.
-    for same in (reach(np.float64(0.8)), reach(np.array(0.8))):
-        rewire_jax.train(settings, folder, scenario=same, resume=True)
-    for other in (reach(0.9), reach(0.8, hidden=0.5)):
-        with pytest.raises(UserError, match="other tasks"):
-            rewire_jax.train(settings, folder, scenario=other, resume=True)
-    far = rewire_jax.train(settings, tmp_path / "far", scenario=reach(0.9))
-    with pytest.raises(UserError, match="other tasks"):
-        write_report([folder, far], tmp_path / "report")
-    # Older versions did not write how tasks differ from their domain.
-    older = changed(folder, tmp_path / "older", lambda header: header.pop("changes"))
-    rewire_jax.train(settings, older, scenario=reach(0.9), resume=True)
-    write_report([older, far], tmp_path / "report")
 
 
 def test_other_names_of_tasks(trained: dict[str, Path], tmp_path: Path) -> None:
