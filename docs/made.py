@@ -207,7 +207,24 @@ def methods(_: str) -> str:
         parts += ["## " + ", ".join(f"`{name}`" for name in names)]
         some = dataclasses.fields(cls)
         parts += [settings(names[0]) if some else prose(cls)]
+        for other in names[1:] if some else ():
+            parts += [f"`{other}` has other values in the paper profile:"]
+            parts += [differing(names[0], other)]
     return "\n\n".join(parts)
+
+
+def differing(one: str, other: str) -> str:
+    """The settings in which two methods of one class differ."""
+    scenario = rewire_jax.make_scenario(_EXAMPLE)
+    first, second = (
+        vars(rewire_jax.preset(scenario, each).options) for each in (one, other)
+    )
+    rows = [
+        [f"`{flag(name)}`", shown(value), shown(second[name])]
+        for name, value in first.items()
+        if value != second[name]
+    ]
+    return table(["setting", f"`{one}`", f"`{other}`"], rows)
 
 
 def by_scenario(_: str) -> str:

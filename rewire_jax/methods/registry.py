@@ -72,6 +72,12 @@ METHODS: dict[str, Entry] = {
         rewire_settings.preset,
         together=rewire_settings.together,
     ),
+    "rewire_tuned": Entry(
+        rewire,
+        rewire_settings.RewireSettings,
+        rewire_settings.preset_tuned,
+        together=rewire_settings.together,
+    ),
     "cka": Entry(cka.cka, cka.CkaSettings, cka.preset),
     "clonex": Entry(
         clonex.clonex, clonex.ClonexSettings, clonex.preset, selection_episodes=1
@@ -84,7 +90,8 @@ METHODS: dict[str, Entry] = {
 }
 
 
-for _name, _entry in METHODS.items():
+# A function that two entries share has the first one's name.
+for _name, _entry in reversed(METHODS.items()):
     kept_programs.give_name(_name, _entry.make)
 
 

@@ -181,3 +181,19 @@ def _published(scenario: str, period: int) -> RewireSettings:
         beta=beta,
         head_slots=slots,
     )
+
+
+def preset_tuned(scenario: str, period: int, profile: str) -> RewireSettings:
+    """This library's choice, the same for every scenario and profile.
+
+    It was made by returns on halfcheetah/forgetting alone: docs/what-works.md.
+    """
+    del scenario, profile
+    return RewireSettings(
+        distillation="squares",
+        beta=100.0,
+        alignment="matching",
+        tau=0.1,
+        noise=0.0,
+        head_slots=period,
+    )

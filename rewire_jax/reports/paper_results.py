@@ -15,11 +15,12 @@ NAMES = {
     "rewire": "Ours (rewire)",
 }
 LABELS = NAMES | {
+    "rewire_tuned": "Rewire, tuned",
     "cka": "CKA-RL",
     "clonex": "ClonEx-SAC",
     "reset_distill": "Reset & Distill",
 }
-"""The names in reports; methods of other papers as those call them."""
+"""The names in reports; methods of other papers are named as there."""
 
 
 class Figures(NamedTuple):

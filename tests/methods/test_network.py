@@ -16,6 +16,7 @@ from rewire_jax.core.settings import Network
 from rewire_jax.envs.scenarios import make_scenario
 from rewire_jax.methods import METHODS, find_method, wiring
 from rewire_jax.methods.base import Method
+from rewire_jax.methods.rewire_settings import RewireSettings
 from rewire_jax.methods.spec import Spec
 from rewire_jax.nn import networks
 from rewire_jax.training.acting import act_function
@@ -33,7 +34,7 @@ def make(name: str, network: str) -> Method:
     quick = rewire_jax.preset(make_scenario("probe/reach"), name, "quick")
     spec = SPEC._replace(network=network)
     options = quick.options.checked()
-    if name == "rewire" and network == "residual":
+    if isinstance(options, RewireSettings) and network == "residual":
         options = dataclasses.replace(options, alignment="off")
     return find_method(name).make(spec, options)
 

@@ -67,6 +67,32 @@ def test_authors_is_the_paper_profile_with_what_their_code_does(method):
     }.get(method, {})
 
 
+def test_the_tuned_preset_is_the_same_everywhere():
+    tuned = {
+        replace(
+            preset(make_scenario(name), "rewire_tuned", profile).options, head_slots=1
+        )
+        for name in SCENARIOS
+        if not name.startswith("probe/")
+        for profile in ("paper", "authors", "quick")
+    }
+    (options,) = tuned
+    published = preset(make_scenario("halfcheetah/forgetting"), "rewire").options
+    assert {n for n, v in vars(options).items() if v != vars(published)[n]} == {
+        "alignment",
+        "tau",
+        "noise",
+        "head_slots",
+    }
+    # The other settings are those of the profile, as for every method.
+    for name in ("ant/forgetting", "halfcheetah/compositionality"):
+        known, ours = (
+            preset(make_scenario(name), method, "quick")
+            for method in ("rewire", "rewire_tuned")
+        )
+        assert replace(ours, method="rewire", options=known.options) == known
+
+
 def test_authors_on_continual_world():
     scenario = make_scenario("continual_world/t3")
     theirs = preset(scenario, "csp", "authors")
