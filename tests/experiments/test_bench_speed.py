@@ -31,7 +31,7 @@ def nothing(count):
 def test_updates_are_measured_against_products(tmp_path, capsys):
     rows = {row["loop"]: row for row in quick(tmp_path / "new", "updates")["updates"]}
     plain = {"square", "shapes", "plain/2"}
-    assert set(rows) == plain | {"rewire/2", "matching/2"}
+    assert set(rows) == plain | {"rewire/2", "tuned/2"}
     for name, row in rows.items():
         assert len(row["seconds"]) == 2
         assert row["best"] >= row["median"] > 0
