@@ -20,18 +20,24 @@ PLASTIC = {
 
 
 # PackNet in the updates after its second pruning; CSP with labels in its buffer, in a
-# task that ends with a search. Then what knobs of SAC need, at a task's start.
+# task that ends with a search; modes that environments hold. Then what knobs of SAC
+# need, at a task's start.
 @pytest.mark.parametrize(
-    ("method", "times", "name", "resumed", "sac"),
+    ("method", "times", "name", "resumed", "sac", "options"),
     [
         pytest.param(
-            *("packnet", 3, "offline_update", "task-001-step-0000040", {}),
+            *("packnet", 3, "offline_update", "task-001-step-0000040", {}, {}),
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            *("csp", 5, "chunk", "task-001-step-0000020", {}), marks=pytest.mark.slow
+            *("csp", 5, "chunk", "task-001-step-0000020", {}, {}),
+            marks=pytest.mark.slow,
         ),
-        ("ft1", 5, "chunk", "task-001", PLASTIC),
+        pytest.param(
+            *("rewire", 7, "chunk", "task-001-step-0000020", {}, {"mode_steps": 7}),
+            marks=pytest.mark.slow,
+        ),
+        ("ft1", 5, "chunk", "task-001", PLASTIC, {}),
     ],
 )
 def test_what_a_method_needs_within_a_task_is_saved(
@@ -40,12 +46,15 @@ def test_what_a_method_needs_within_a_task_is_saved(
     name: str,
     resumed: str,
     sac: dict[str, Any],
+    options: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     settings = dataclasses.replace(tiny(method=method), tasks=2, selection_episodes=1)
     settings = dataclasses.replace(
-        settings, sac=dataclasses.replace(settings.sac, **sac)
+        settings,
+        sac=dataclasses.replace(settings.sac, **sac),
+        options=dataclasses.replace(settings.options, **options),
     )
     whole = train_run.train(settings, tmp_path / "whole")
     train_until(monkeypatch, settings, tmp_path / "parts", times, name)
