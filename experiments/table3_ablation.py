@@ -13,6 +13,8 @@ import rewire_jax
 from experiments import averages, suite
 from rewire_jax.core.errors import UserError
 from rewire_jax.reports import paper_results
+from rewire_jax.reports.campaign_data import read_campaign_data
+from rewire_jax.reports.campaign_section import sections
 from rewire_jax.reports.provenance import origin
 from rewire_jax.reports.report import Report
 from rewire_jax.reports.run_summary import Comparison, Summary
@@ -79,8 +81,7 @@ def report(job: Table3, out: Path) -> tuple[Report[Comparison], dict[str, Summar
         (made,) = suite.reports(runs, out)
         names = [summary.run.folder.name for summary in made.numbers.summaries]
         return made, dict(zip(names, made.numbers.summaries, strict=True))
-    whole = rewire_jax.write_campaign_report(job.campaign, job.trained_in)
-    for section in whole.sections:
+    for section in sections(read_campaign_data(job.campaign, job.trained_in)):
         names = [slug(name) for name in section.names]
         found = dict(zip(names, section.report.numbers.summaries, strict=True))
         scenario = found[names[0]].run.settings["scenario"]

@@ -24,11 +24,7 @@ T = TypeVar("T")
 PROG = "rewire-jax"
 _HELP = {"-h", "--help"}
 _EXAMPLE = "halfcheetah/forgetting"  # whose defaults `train --help` shows
-_AXES = {
-    "--modes": ("--axis", "modes"),
-    "--alpha": ("--axis", "alpha"),
-    "--beta": ("--axis", "beta"),
-}
+_AXES = {f"--{name}": ("--axis", name) for name in ("modes", "alpha", "beta")}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -59,31 +59,19 @@ def distribution(
     Its scores have the context's noise. If the environments hold modes of their own,
     each row is that of its environment's mode.
     """
+
+    def of_scores(scores):
+        return forward(design, params, state, scores, context.key, observation)
+
     if jnp.ndim(context.mode):
-        return held_modes(design, params, state, context, observation)
+        # All modes act in all environments, so that no environment permutes on its own.
+        every = jax.vmap(of_scores)(params.scores)
+        return jax.tree.map(lambda x: x[context.mode, jnp.arange(x.shape[1])], every)
     scores = params.scores[context.mode]
     if design.options.mode_rate == "gradient":
         # Adds exactly 0, so that close scores keep their order.
         scores += (design.modes - 1) * (scores - jax.lax.stop_gradient(scores))
-    scores += context.noise
-    return forward(design, params, state, scores, context.key, observation)
-
-
-def held_modes(
-    design: Design,
-    params: Params,
-    state: State,
-    context: Context,
-    observation: jax.Array,
-) -> Gaussian:
-    """Returns mean and log-std `[envs, actions]` of the mode that each one holds."""
-
-    def of_mode(scores):
-        return forward(design, params, state, scores, context.key, observation)
-
-    # All modes act in all environments, so that no environment permutes on its own.
-    every = jax.vmap(of_mode)(params.scores)
-    return jax.tree.map(lambda x: x[context.mode, jnp.arange(x.shape[1])], every)
+    return of_scores(scores + context.noise)
 
 
 def forward(

@@ -1,7 +1,6 @@
 """Headers that were changed after training."""
 
 import dataclasses
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,9 +12,8 @@ import pytest
 import rewire_jax
 from rewire_jax import UserError, write_report
 from rewire_jax.run.header_check import check_header
+from tests.changed_header import Header, changed
 from tests.small_sweep import run_sweep, small
-
-Header = dict[str, Any]
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +23,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     run_sweep(root / "sweep", small(seeds=2), axes={"beta": [1, 10]})
     rewire_jax.train(small(seeds=2), root / "run")
     return {"run": root / "run", "sweep": root / "sweep"}
-
-
-def changed(folder: Path, out: Path, change: Callable[[Header], Any]) -> Path:
-    """A copy with another header."""
-    shutil.copytree(folder, out)
-    path = out / "settings.json"
-    header = json.loads(path.read_text())
-    change(header)
-    path.write_text(json.dumps(header))
-    return out
 
 
 def swap(header: Header) -> None:

@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -18,6 +16,7 @@ import rewire_jax
 from rewire_jax import ScenarioSpec, TaskChange, UserError, make_scenario, write_report
 from rewire_jax.envs.scenarios import Scenario, register_scenario
 from rewire_jax.run.task_header import header_of_tasks
+from tests.changed_header import changed
 from tests.small_sweep import small
 
 
@@ -41,16 +40,6 @@ def train(folder: Path, scenario: Scenario, resume: bool = False) -> Path:
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(tmp_path_factory.mktemp("trained") / "run", reach())
-
-
-def changed(folder: Path, out: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
-    """A copy with another header."""
-    shutil.copytree(folder, out)
-    path = out / "settings.json"
-    header = json.loads(path.read_text())
-    change(header)
-    path.write_text(json.dumps(header))
-    return out
 
 
 def test_other_values_under_the_same_names(trained: Path, tmp_path: Path) -> None:
